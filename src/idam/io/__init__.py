@@ -1,0 +1,23 @@
+"""Reading and writing point clouds and transforms.
+
+Whatever is wrong with a file, a folder or an array ends in :class:`idam.errors.InputError`, whose one line names the
+file and says what to do. Every write is atomic: a failed one leaves the old file as it was, and nothing beside it.
+"""
+
+from idam.io.cloud import PointCloud
+from idam.io.convert import as_point_cloud
+from idam.io.files import write_json, write_text
+from idam.io.formats import read_point_cloud, write_point_cloud
+from idam.io.transforms import format_transform, read_transform, write_transform
+
+__all__ = [
+    "PointCloud",
+    "as_point_cloud",
+    "format_transform",
+    "read_point_cloud",
+    "read_transform",
+    "write_json",
+    "write_point_cloud",
+    "write_text",
+    "write_transform",
+]

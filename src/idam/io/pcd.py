@@ -1,0 +1,177 @@
+"""PCD, the format of the Point Cloud Library: ASCII, binary and LZF-compressed binary."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from idam.errors import InputError
+from idam.io.cloud import PointCloud
+from idam.io.columns import check_size, cloud_from_columns, parse_numbers
+from idam.io.files import check_unpacked_size
+
+__all__ = ["decode", "encode"]
+
+_END_OF_HEADER = re.compile(rb"^DATA[ \t]+(ascii|binary_compressed|binary)[ \t]*\r?$\n?", re.MULTILINE)
+_PACKED_COLORS = ("rgb", "rgba")
+
+
+@dataclass(frozen=True)
+class _Header:
+    names: list[str]
+    types: list[np.dtype[Any]]
+    counts: list[int]  # values of each field in a point
+    points: int
+
+
+def decode(data: bytes) -> PointCloud:
+    """The points of a PCD file.
+
+    Raises:
+        InputError: the file is damaged, or has no finite coordinates.
+    """
+    match = _END_OF_HEADER.search(data)
+    if match is None:
+        raise InputError("not a PCD file (its header has no line DATA ascii, binary or binary_compressed)")
+    header = _parse_header(data[: match.start()].decode("latin-1"))
+    body = data[match.end() :]
+    read = {b"ascii": _read_ascii, b"binary": _read_binary, b"binary_compressed": _read_compressed}[match[1]]
+    columns = dict(zip(header.names, read(header, body), strict=True))
+    return cloud_from_columns(_unpack_colors(columns))
+
+
+def encode(cloud: PointCloud, coordinates: str) -> bytes:
+    """A binary PCD file with coordinates of type ``f4`` or ``f8``."""
+    names, types, columns = ["x", "y", "z"], [coordinates] * 3, [*cloud.points.T]
+    if cloud.normals is not None:
+        names += ["normal_x", "normal_y", "normal_z"]
+        types += ["f4"] * 3
+        columns += [*cloud.normals.T]
+    if cloud.colors is not None:
+        red, green, blue = cloud.colors.T.astype(np.uint32)
+        names.append("rgb")
+        types.append("f4")  # the bits of an integer in a float: what every reader of PCD expects
+        columns.append((red << 16 | green << 8 | blue).view(np.float32))
+    rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, code in zip(names, types, strict=True)])
+    for name, values in zip(names, columns, strict=True):
+        rows[name] = values
+    header = (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(names)}\n"
+        f"SIZE {' '.join(code[1] for code in types)}\nTYPE {' '.join('F' for _ in types)}\n"
+        f"COUNT {' '.join('1' for _ in types)}\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(rows)}\nDATA binary\n"
+    )
+    return header.encode() + rows.tobytes()
+
+
+def _parse_header(text: str) -> _Header:
+    entries = {words[0]: words[1:] for line in text.splitlines() if (words := line.split())}
+    try:
+        names = entries.get("FIELDS") or entries["COLUMNS"]
+        kinds = [{"F": "f", "I": "i", "U": "u"}[kind] for kind in entries["TYPE"]]
+        types = [np.dtype(f"<{kind}{int(size)}") for kind, size in zip(kinds, entries["SIZE"], strict=True)]
+        counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
+        points = int(entries["POINTS"][0]) if "POINTS" in entries else _product(entries["WIDTH"] + entries["HEIGHT"])
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise InputError("damaged: its header lacks FIELDS, SIZE, TYPE or POINTS: export it again") from error
+    if not len(names) == len(types) == len(counts) or min(counts, default=0) < 1 or points < 0:
+        raise InputError("damaged: FIELDS, SIZE, TYPE and COUNT in its header do not agree: export it again")
+    return _Header(names, types, counts, points)
+
+
+def _product(numbers: list[str]) -> int:
+    width, height = map(int, numbers)
+    return width * height
+
+
+def _read_ascii(header: _Header, body: bytes) -> list[NDArray[Any]]:
+    row = sum(header.counts)
+    table = parse_numbers(body)
+    check_size(header.points * row, len(table), f"{header.points:,} points", "numbers")
+    table = table[: header.points * row].reshape(header.points, row)
+    starts = np.cumsum([0, *header.counts[:-1]])
+    return [_as_declared(table[:, start], kind) for start, kind in zip(starts, header.types, strict=True)]
+
+
+def _as_declared(values: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Integers as integers, and the floats that may hold a packed colour as such; doubles as they are."""
+    return values.astype(np.int64).astype(kind) if kind.kind != "f" else values
+
+
+def _read_binary(header: _Header, body: bytes) -> list[NDArray[Any]]:
+    _check_binary_size(header, len(body))
+    fields = zip(header.types, header.counts, strict=True)
+    layout = np.dtype([(f"{index}", kind, (count,)) for index, (kind, count) in enumerate(fields)])
+    rows = np.frombuffer(body, layout, header.points)
+    return [rows[name][:, 0] for name in layout.names or ()]
+
+
+def _read_compressed(header: _Header, body: bytes) -> list[NDArray[Any]]:
+    """Compressed data hold one field after the other, not one point after the other."""
+    check_size(8, len(body), "compressed data")
+    packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
+    check_size(packed, len(body) - 8, "compressed data")
+    check_unpacked_size(unpacked, packed)
+    _check_binary_size(header, unpacked)
+    data = _decompress_lzf(body[8 : 8 + packed], unpacked)
+    columns, offset = [], 0
+    for kind, count in zip(header.types, header.counts, strict=True):
+        values = np.frombuffer(data, kind, header.points * count, offset)
+        columns.append(values.reshape(header.points, count)[:, 0])
+        offset += values.nbytes
+    return columns
+
+
+def _check_binary_size(header: _Header, available: int) -> None:
+    row = sum(kind.itemsize * count for kind, count in zip(header.types, header.counts, strict=True))
+    check_size(header.points * row, available, f"{header.points:,} points")
+
+
+def _decompress_lzf(data: bytes, size: int) -> bytes:
+    """LZF: runs of literal bytes, and references (length, distance) to what came before."""
+    out = bytearray()
+    at = 0
+    while at < len(data) and len(out) <= size:
+        control = data[at]
+        if control < 32:
+            out += data[at + 1 : at + control + 2]
+            at += control + 2
+            continue
+        length = control >> 5
+        if length == 7:
+            at += 1
+            length += data[at]
+        distance = ((control & 31) << 8) + data[at + 1] + 1
+        at += 2
+        if distance > len(out):
+            raise InputError("damaged: its compressed data refer to what is not there: copy or export it again")
+        _repeat(out, distance, length + 2)
+    if len(out) != size:
+        raise InputError(f"damaged: its data unpack to {len(out):,} bytes, not {size:,}: copy or export it again")
+    return bytes(out)
+
+
+def _repeat(out: bytearray, distance: int, length: int) -> None:
+    """Append ``length`` bytes from ``distance`` back; what is appended may itself be repeated."""
+    start = len(out) - distance
+    block = out[start : start + length]
+    out += (block * (length // len(block) + 1))[:length]
+
+
+def _unpack_colors(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Add red, green and blue for a field that holds them in the bytes of one number."""
+    unpacked = dict(columns)
+    for name in _PACKED_COLORS:
+        if name in columns:
+            values = columns[name]
+            if values.dtype.kind == "f":
+                values = values.astype(np.float32).view(np.uint32)
+            bits = values.astype(np.int64)
+            for color, shift in (("red", 16), ("green", 8), ("blue", 0)):
+                unpacked[color] = (bits >> shift & 255).astype(np.uint8)
+    return unpacked

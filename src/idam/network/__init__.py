@@ -1,0 +1,1 @@
+"""The IDAM network, one file for each section of the paper."""

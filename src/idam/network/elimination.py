@@ -1,0 +1,69 @@
+"""Two-stage point elimination (section 3.3): hard, before matching, and hybrid, within every iteration."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from idam.network.layers import NormalisedLinear
+
+__all__ = ["Significance", "Validity", "hybrid_weights", "keep_most_significant"]
+
+
+class Significance(nn.Module):
+    """The significance score s(i) of each point from its own feature (section 3.3.1): (B, N, K) -> (B, N).
+
+    Trained to be the negative entropy of the point's row of the similarity matrix: high where matching it is easy.
+    """
+
+    def __init__(self, feature_channels: int, channels: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            NormalisedLinear(feature_channels, channels), NormalisedLinear(channels, channels), nn.Linear(channels, 1)
+        )
+        # start at the negative entropy of a uniform row of 128 points, so that learning that constant, a large error
+        # at first, does not shape the features
+        nn.init.constant_(self.mlp[-1].bias, -math.log(128))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Scores (B, N) of features (B, N, K)."""
+        scores: Tensor = self.mlp(features)
+        return scores.squeeze(-1)
+
+
+def keep_most_significant(significance: Tensor, keep: float) -> Tensor:
+    """Hard elimination: indices (B, M) of the M = ceil(keep N) points of highest significance (B, N) (section 3.3.1).
+
+    Never fewer than three points, which a rigid transform needs.
+    """
+    count = significance.shape[-1]
+    # the small slack keeps ceil(N / 6) exact where keep * N is an integer up to rounding
+    kept = min(count, max(3, math.ceil(keep * count - 1e-9)))
+    return significance.topk(kept, dim=-1).indices
+
+
+class Validity(nn.Module):
+    """The validity of each match from its row of pair features (section 3.3.2): sigmoid(f(max_j F(i, j)))."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(NormalisedLinear(channels, channels), nn.Linear(channels, 1))
+
+    def forward(self, pairs: Tensor) -> Tensor:
+        """Logits (B, M) of the validity from pair features (B, M, L, channels)."""
+        logits: Tensor = self.mlp(pairs.amax(2))
+        return logits.squeeze(-1)
+
+
+def hybrid_weights(validity: Tensor, keep: float) -> Tensor:
+    """Hybrid elimination: w_i = v(i) [v(i) >= quantile], normalised to sum 1 (section 3.3.2, equation 7).
+
+    Args:
+        validity: v (B, M) in [0, 1].
+        keep: share of matches that stay; 0.5 is the paper's median cut.
+    """
+    threshold = validity.float().quantile(1.0 - keep, dim=-1, keepdim=True, interpolation="lower").to(validity.dtype)
+    weight = torch.where(validity >= threshold, validity, 0.0)
+    return weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)

@@ -1,0 +1,26 @@
+"""Point features behind one interface: a module (B, N, 3) -> (B, N, channels), with ``channels`` as an attribute."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from idam.network.features.fpfh import FPFH
+from idam.network.features.gnn import GNN
+
+if TYPE_CHECKING:
+    from idam.network.model import Config
+
+__all__ = ["FPFH", "GNN", "build_features"]
+
+
+def build_features(config: Config) -> GNN | FPFH:
+    """The feature extractor that a configuration names.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    if config.features == "gnn":
+        return GNN(config.neighbours)
+    if config.features == "fpfh":
+        return FPFH(normal_radius=config.normal_radius, feature_radius=config.feature_radius)
+    raise ValueError(f"unknown features {config.features!r}: choose 'gnn' or 'fpfh'")

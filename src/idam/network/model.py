@@ -1,0 +1,186 @@
+"""IDAM: iterative distance-aware similarity matrix convolution (section 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from idam.geometry import apply_transform, compose, gather_points, weighted_procrustes
+from idam.network.elimination import Significance, Validity, hybrid_weights, keep_most_significant
+from idam.network.features import build_features
+from idam.network.similarity import SimilarityConvolution
+
+__all__ = ["IDAM", "Config", "Iteration", "Output"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """What makes one IDAM different from another; the defaults are the paper's.
+
+    Attributes:
+        features: ``gnn`` (appendix A) or ``fpfh``.
+        neighbours: K of the GNN's graph.
+        normal_radius: radius of FPFH's normals, in the cloud's units.
+        feature_radius: radius of FPFH's histograms, in the cloud's units.
+        channels: channels of the similarity convolution.
+        blocks: iterations that have weights of their own.
+        iterations: iterations run; those past ``blocks`` use the last block's weights again.
+        keep: share of each cloud's points that hard elimination keeps.
+        keep_matches: share of matches that hybrid elimination keeps.
+        soft_matches: match a point to its row's expectation (the mean of the target, weighted by similarity) rather
+            than to the row's best target point.
+    """
+
+    features: str = "gnn"
+    neighbours: int = 12
+    normal_radius: float = 0.1
+    feature_radius: float = 0.2
+    channels: int = 32
+    blocks: int = 3
+    iterations: int = 3
+    keep: float = 1 / 6
+    keep_matches: float = 0.5
+    soft_matches: bool = False
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One iteration, of M source and L target key points.
+
+    Attributes:
+        source: the source's key points as the iteration found them, moved by all before it, (B, M, 3).
+        score: pair scores before the softmax, (B, M, L).
+        match: where each source point goes to in the target, (B, M, 3).
+        correspondence: the row's best target point, argmax_j S(i, j), (B, M).
+        validity_logit: logit of the validity v(i), (B, M).
+        weight: w_i of the Procrustes problem, (B, M), sum 1.
+        rotation: of this iteration's own step, (B, 3, 3).
+        translation: of this iteration's own step, (B, 3).
+    """
+
+    source: Tensor
+    score: Tensor
+    match: Tensor
+    correspondence: Tensor
+    validity_logit: Tensor
+    weight: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    @property
+    def similarity(self) -> Tensor:
+        """The similarity matrix S (B, M, L), each row a distribution over the target's key points (equation 3)."""
+        return self.score.softmax(-1)
+
+    @property
+    def validity(self) -> Tensor:
+        """v(i), the probability that the match of each source key point is right, (B, M)."""
+        return self.validity_logit.sigmoid()
+
+
+@dataclass(frozen=True)
+class Output:
+    """The registration of B pairs.
+
+    Attributes:
+        rotation: (B, 3, 3), of the whole transform from source to target.
+        translation: (B, 3).
+        iterations: what each iteration saw and did.
+        source_index: rows (B, M) of the source that hard elimination kept.
+        target_index: rows (B, L) of the target that hard elimination kept.
+        source_significance: s(i) of every source point, (B, N).
+        target_significance: s(j) of every target point, (B, P).
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    iterations: list[Iteration]
+    source_index: Tensor
+    target_index: Tensor
+    source_significance: Tensor
+    target_significance: Tensor
+
+
+class IDAM(nn.Module):
+    """The network of the paper: features, hard elimination, and the iterated match, eliminate, solve, move."""
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__()
+        self.config = config or Config()
+        self.features = build_features(self.config)
+        channels = self.features.channels
+        self.significance = Significance(channels, self.config.channels)
+        self.similarity = nn.ModuleList(
+            SimilarityConvolution(channels, self.config.channels) for _ in range(self.config.blocks)
+        )
+        self.validity = nn.ModuleList(Validity(self.config.channels) for _ in range(self.config.blocks))
+
+    def forward(self, source: Tensor, target: Tensor) -> Output:
+        """Register batches of clouds: the transform that lays each source on its target (algorithm of figure 2).
+
+        Args:
+            source: (B, N, 3), centred and scaled like the training data (about the unit sphere).
+            target: (B, P, 3); P may differ from N.
+
+        Returns:
+            The transform, with everything each iteration saw. Scores and validity are differentiable in the weights;
+            the transform is not: no gradient passes the SVD (section 3.4).
+        """
+        source_features, target_features = self.encode(source, target)
+        source_significance = self.significance(source_features)
+        target_significance = self.significance(target_features)
+        source_index = keep_most_significant(source_significance, self.config.keep)
+        target_index = keep_most_significant(target_significance, self.config.keep)
+        iterations = self.iterate(
+            gather_points(source, source_index),
+            gather_points(target, target_index),
+            gather_points(source_features, source_index),
+            gather_points(target_features, target_index),
+        )
+        rotation, translation = chain(iterations)
+        return Output(
+            rotation, translation, iterations, source_index, target_index, source_significance, target_significance
+        )
+
+    def encode(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (B, N, K) and (B, P, K) of both clouds; equally large clouds go through as one batch."""
+        if source.shape == target.shape:
+            source_features, target_features = self.features(torch.cat([source, target])).chunk(2)
+            return source_features, target_features
+        return self.features(source), self.features(target)
+
+    def iterate(
+        self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor
+    ) -> list[Iteration]:
+        """Match key points (B, M, 3) to (B, L, 3), solve for the step, move the source, and again."""
+        iterations: list[Iteration] = []
+        for n in range(self.config.iterations):
+            block = min(n, self.config.blocks - 1)
+            pairs, score = self.similarity[block](source, target, source_features, target_features)
+            step = self._solve(source, target, score, self.validity[block](pairs))
+            iterations.append(step)
+            with torch.autocast(source.device.type, enabled=False):
+                source = apply_transform(source, step.rotation, step.translation)
+        return iterations
+
+    @torch.no_grad()
+    def _solve(self, source: Tensor, target: Tensor, score: Tensor, validity_logit: Tensor) -> Iteration:
+        correspondence = score.argmax(-1)
+        with torch.autocast(source.device.type, enabled=False):
+            weight = hybrid_weights(validity_logit.to(source.dtype).sigmoid(), self.config.keep_matches)
+            if self.config.soft_matches:
+                match = score.to(source.dtype).softmax(-1) @ target
+            else:
+                match = gather_points(target, correspondence)
+            rotation, translation = weighted_procrustes(source, match, weight)
+        return Iteration(source, score, match, correspondence, validity_logit, weight, rotation, translation)
+
+
+def chain(iterations: list[Iteration]) -> tuple[Tensor, Tensor]:
+    """The whole transform, rotation (B, 3, 3) and translation (B, 3), of consecutive steps."""
+    rotation, translation = iterations[0].rotation, iterations[0].translation
+    for step in iterations[1:]:
+        rotation, translation = compose(step.rotation, step.translation, rotation, translation)
+    return rotation, translation

@@ -1,0 +1,98 @@
+"""The shipped models: names, weights, configuration and provenance, all in one safetensors file each."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from idam.errors import InputError
+from idam.network.model import IDAM, Config
+
+__all__ = ["list_models", "load_model", "provenance", "save_model"]
+
+DEFAULT = "gnn-unseen-shapes"
+"""The model behind the name ``default``."""
+
+
+def list_models() -> list[str]:
+    """Names of the shipped models, for :func:`load_model`."""
+    return sorted(Path(entry.name).stem for entry in _folder().iterdir() if entry.name.endswith(".safetensors"))
+
+
+def load_model(name: str | os.PathLike[str] = "default", device: str | torch.device | None = None) -> IDAM:
+    """A model with its weights, in evaluation mode.
+
+    Args:
+        name: one of :func:`list_models`, ``default``, or the path of a ``.safetensors`` file that ``idam train`` wrote.
+        device: where to put it; the CPU if None.
+
+    Raises:
+        InputError: there is no such model, or the file is not a model.
+    """
+    path = find(name)
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+        model = IDAM(Config(**json.loads(metadata["config"])))
+        model.load_state_dict(state)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0][:120]
+        raise InputError(f"{path}: not a model that idam wrote ({reason}); use one of {_names()}") from None
+    return model.eval().requires_grad_(False).to(device or "cpu")
+
+
+def provenance(name: str | os.PathLike[str]) -> dict[str, Any]:
+    """How a model came about: experiment, data, seed, command, commit, steps and scores."""
+    with safe_open(find(name), "pt") as file:
+        metadata = file.metadata() or {}
+    return {"config": json.loads(metadata["config"]), **json.loads(metadata.get("provenance", "{}"))}
+
+
+def save_model(path: Path, model: IDAM, provenance: dict[str, Any]) -> None:
+    """Write weights, configuration and provenance to one file, atomically.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+    metadata = {"config": json.dumps(asdict(model.config)), "provenance": json.dumps(provenance)}
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            file.write(save(state, metadata))
+        Path(file.name).replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+def find(name: str | os.PathLike[str]) -> Path:
+    """The file of a model.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    if os.fspath(name) == "default":
+        name = DEFAULT
+    path = Path(name)
+    if path.suffix != ".safetensors":
+        path = Path(str(_folder() / f"{os.fspath(name)}.safetensors"))
+    if not path.is_file():
+        raise InputError(f"unknown model {os.fspath(name)!r}: use one of {_names()}, or the path of a .safetensors file")
+    return path
+
+
+def _names() -> str:
+    return ", ".join(["default", *list_models()])
+
+
+def _folder() -> Any:
+    return resources.files("idam") / "weights"

@@ -1,0 +1,281 @@
+"""One registration as a page to look at: a self-contained HTML file that opens offline in any browser.
+
+Python fills in the figures and packs the points; ``report_page.html`` beside this file draws them.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+import re
+from importlib import resources
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from idam.io import PointCloud, write_text
+from idam.result import Matches, RegistrationResult
+
+__all__ = ["MAX_POINTS", "write_report"]
+
+MAX_POINTS = 100_000
+"""Points of each cloud a page shows at most."""
+
+_STEPS = 65535
+"""Coordinates are sent as 16-bit integers: steps along the longest side of a cloud's bounding box."""
+
+_VERDICTS = (
+    (0.9, "high", "The clouds are very likely aligned."),
+    (0.7, "fair", "The clouds are probably aligned; a look at the picture settles it."),
+    (0.4, "fair", "The clouds may be misaligned: check the picture before using the transform."),
+    (0.0, "low", "The clouds are probably misaligned: do not use the transform unchecked."),
+)
+"""From this confidence on: the style of the bar, and what it means."""
+
+_Rows = list[tuple[str, str]]
+
+
+def write_report(
+    path: str | PathLike[str],
+    source: PointCloud,
+    target: PointCloud,
+    result: RegistrationResult,
+    *,
+    source_name: str,
+    target_name: str,
+) -> None:
+    """Write the page of one registration: the pair before and after, the network's matches, and the figures.
+
+    The page refers to nothing outside itself. It shows at most :data:`MAX_POINTS` of each cloud, and says so. The same
+    input gives the same bytes.
+
+    Args:
+        path: the HTML file to write, atomically.
+        source: the source as it was given to ``register``, not moved.
+        target: the target.
+        result: what ``register`` returned for them.
+        source_name: what the page calls the source, such as its file name.
+        target_name: what the page calls the target.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    shown = _sample(source.points), _sample(target.points)
+    template = resources.files("idam").joinpath("report_page.html").read_text(encoding="utf-8")
+    level, verdict = _verdict(result.confidence)
+    page = _fill(
+        template,
+        source_name=_escape(source_name),
+        target_name=_escape(target_name),
+        confidence=_chance(result.confidence),
+        confidence_percent=f"{100 * result.confidence:.1f}",
+        level=level,
+        verdict=verdict,
+        headlines=_headlines(result),
+        matrix=_matrix(result.transformation),
+        matrix_text=_escape("\n".join(" ".join(map(repr, row)) for row in result.transformation.tolist())),
+        source_count=_count(shown[0], source.points),
+        target_count=_count(shown[1], target.points),
+        details=_details(result, source, target, source_name, target_name),
+        scene=_json(_scene(*shown, result)),
+    )
+    write_text(path, page)
+
+
+# The figures
+
+
+def _headlines(result: RegistrationResult) -> str:
+    """The four figures at the top, as cards."""
+    rotation = result.transformation[:3, :3]
+    # the arc sine of the chord, unlike the arc cosine of the trace, is accurate for small angles too
+    angle = 2 * math.asin(min(1.0, float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8)))
+    distance = _number(result.max_correspondence_distance, 3)
+    cards = [
+        ("Fitness", f"{100 * result.fitness:.1f} %", f"of the source lies within {distance} of the target"),
+        ("Inlier RMSE", _number(result.inlier_rmse, 3), "distance of those points, in the input’s unit"),
+        ("Rotation", f"{_number(math.degrees(angle))}°", "of the source, about one axis"),
+        ("Translation", _number(float(np.linalg.norm(result.transformation[:3, 3]))), "its length, in the input’s unit"),
+    ]
+    return "\n".join(
+        f'<div class="card"><h2>{label}</h2><p class="figure">{value}</p><p class="note">{note}</p></div>'
+        for label, value, note in cards
+    )
+
+
+def _details(
+    result: RegistrationResult, source: PointCloud, target: PointCloud, source_name: str, target_name: str
+) -> str:
+    """The other figures, as the rows of a table."""
+    kept = int(np.count_nonzero(result.matches.weight))
+    moved = result.apply(source.points.mean(axis=0)) - source.points.mean(axis=0)
+    rows: _Rows = [
+        ("Source", f"{source_name}, {len(source.points):,} points"),
+        ("Target", f"{target_name}, {len(target.points):,} points"),
+        ("Source’s centroid moves by", _number(float(np.linalg.norm(moved)))),
+        ("Inlier pairs", f"{len(result.correspondence_set):,}"),
+        ("Max correspondence distance", _number(result.max_correspondence_distance)),
+        ("Matches of the network", f"{kept:,} kept, {len(result.matches.weight) - kept:,} eliminated"),
+        ("Model", result.model),
+        ("Time", f"{_number(result.seconds, 3)} s"),
+    ]
+    return "\n".join(f"<tr><th>{_escape(label)}</th><td>{_escape(value)}</td></tr>" for label, value in rows)
+
+
+def _matrix(transformation: NDArray[np.float64]) -> str:
+    """The 4x4 as table rows, the translation with decimals to suit its size."""
+    largest = float(np.abs(transformation[:3, 3]).max())
+    decimals = min(9, max(3, 6 - math.floor(math.log10(largest)))) if largest else 6
+    rows = [[*(f"{value:.6f}" for value in row[:3]), f"{row[3]:.{decimals}f}"] for row in transformation[:3].tolist()]
+    rows.append(["0", "0", "0", "1"])
+    return "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows).replace("-", "−")
+
+
+def _count(shown: NDArray[np.float64], points: NDArray[np.float64]) -> str:
+    """How many points there are, and how many of them are shown if not all."""
+    if len(shown) == len(points):
+        return f"{len(points):,} points"
+    return f"showing {len(shown):,} of {len(points):,} points"
+
+
+def _verdict(confidence: float) -> tuple[str, str]:
+    """The bar's style and the sentence for a confidence."""
+    return next((level, verdict) for least, level, verdict in _VERDICTS if confidence >= least or least == 0)
+
+
+def _chance(confidence: float) -> str:
+    """A probability in whole per cent, never rounded to certainty."""
+    if confidence > 0.99:
+        return "> 99 %"
+    return "< 1 %" if confidence < 0.01 else f"{100 * confidence:.0f} %"
+
+
+def _number(value: float, digits: int = 4) -> str:
+    """A number of any unit and size to that many significant digits."""
+    if not math.isfinite(value):
+        return "n/a"
+    magnitude = math.floor(math.log10(abs(value))) if value else 0
+    if not -5 <= magnitude <= 9:
+        text = f"{value:.{digits - 1}e}"
+    else:
+        text = f"{value:,.{max(0, digits - 1 - magnitude)}f}"
+    return text.replace("-", "−")
+
+
+# The scene
+
+
+def _scene(source: NDArray[np.float64], target: NDArray[np.float64], result: RegistrationResult) -> dict[str, Any]:
+    """What the page's script draws, in coordinates around the target's centre.
+
+    A cloud's own coordinates are relative to its centre, so that float32 is enough for what was in metres of a
+    national grid; the two poses of the source take its coordinates to the target's.
+    """
+    clouds = [_cloud(source), _cloud(target)]
+    centres = [np.array(cloud["centre"]) for cloud in clouds]
+    local = [points - centre for points, centre in zip((source, target), centres, strict=True)]
+    rotation = result.transformation[:3, :3]
+    moved = result.apply(centres[0]) - centres[1]
+    offset, gap = _approach(local, centres[0] - centres[1])
+    return {
+        "source": clouds[0],
+        "target": clouds[1],
+        "matches": _matches(result.matches, centres),
+        "before": {"pose": _pose(np.eye(3), offset), "gap": gap, **_view(local[0] + offset, local[1])},
+        "after": {"pose": _pose(rotation, moved), "gap": "", **_view(local[0] @ rotation.T + moved, local[1])},
+        "up": _up(target),
+    }
+
+
+def _sample(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """At most :data:`MAX_POINTS` finite ones of the points, always the same, in their order."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) <= MAX_POINTS:
+        return points
+    # at random: every n-th point of an ordered scan would leave stripes
+    return points[np.sort(np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False))]
+
+
+def _cloud(points: NDArray[np.float64]) -> dict[str, Any]:
+    """Points as 16-bit integers: coordinate = centre + step (integer - 32767.5)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = (low + high) / 2
+    step = float((high - low).max()) / _STEPS or 1.0
+    quantised = np.rint((points - centre) / step + _STEPS / 2).clip(0, _STEPS)
+    return {"points": _base64(quantised, "<u2"), "centre": centre.tolist(), "step": step}
+
+
+def _matches(matches: Matches, centres: list[NDArray[np.float64]]) -> dict[str, Any]:
+    """Matches from weak to strong, so that the strong are drawn last; each end relative to its cloud's centre."""
+    order = np.argsort(matches.weight, kind="stable")
+    ends = [(matches.source - centres[0])[order], (matches.target - centres[1])[order]]
+    return {
+        "ends": _base64(np.concatenate(ends, axis=1), "<f4"),
+        "weights": _base64(matches.weight[order], "<f4"),
+        "strongest": _number(float(matches.weight.max(initial=0)), 2),
+    }
+
+
+def _approach(local: list[NDArray[np.float64]], offset: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+    """The source's offset before, shortened where the clouds lie too far apart to be seen in one picture.
+
+    Returns:
+        The offset to draw, and the distance it stands for as text, empty where it is drawn as it is.
+    """
+    reach = sum(_view(points)["radius"] for points in local)
+    gap = float(np.linalg.norm(offset))
+    if gap <= 3 * reach:
+        return offset, ""
+    return offset * (1.2 * reach / gap), _number(gap)
+
+
+def _view(*clouds: NDArray[np.float64]) -> dict[str, Any]:
+    """Centre and radius of the sphere to look at; a few stray points are left outside."""
+    ranges = np.stack([np.percentile(points, [1, 99], axis=0) for points in clouds])
+    centre = (ranges[:, 0].min(axis=0) + ranges[:, 1].max(axis=0)) / 2
+    radius = max(float(np.percentile(np.linalg.norm(points - centre, axis=1), 99)) for points in clouds)
+    return {"centre": centre.tolist(), "radius": radius or 1.0}
+
+
+def _up(points: NDArray[np.float64]) -> str:
+    """The axis that probably points up, to begin with: the page lets one choose another."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    width, depth, height = high - low
+    if height < 0.5 * min(width, depth):
+        return "+z"  # flat: ground seen by a laser scanner
+    if low[2] > 0 and max(np.abs([low[:2], high[:2]]).max(axis=0)) < high[2]:
+        return "-y"  # in front of the origin: a depth camera's frame
+    return "+y"
+
+
+def _pose(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> list[list[float]]:
+    """The upper three rows of a 4x4."""
+    rows: list[list[float]] = np.column_stack([rotation, translation]).tolist()
+    return rows
+
+
+# Text
+
+
+def _base64(values: NDArray[Any], dtype: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode("ascii")
+
+
+def _json(value: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _escape(text: str) -> str:
+    """Any text, even a file name that is not Unicode, for use in HTML."""
+    return html.escape(text.encode("utf-8", "replace").decode("utf-8"))
+
+
+def _fill(template: str, **fields: str) -> str:
+    """Put each field in place of its ``{{name}}``, in one pass: what is put in is not searched again."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: fields[match[1]], template)

@@ -1,0 +1,87 @@
+"""What a registration returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Matches", "RegistrationResult"]
+
+
+@dataclass(frozen=True)
+class Matches:
+    """The network's weighted matches of key points, in the input's coordinates and units.
+
+    Attributes:
+        source: key points of the source, (M, 3), where the source was given (not moved).
+        target: the match of each in the target, (M, 3).
+        weight: their weights in the Procrustes problem of the last iteration, (M,), 0 for eliminated ones, sum 1.
+    """
+
+    source: NDArray[np.float64]
+    target: NDArray[np.float64]
+    weight: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RegistrationResult:
+    """The rigid transform that lays the source on the target, and how good it is.
+
+    Attributes:
+        transformation: (4, 4), maps source coordinates to target coordinates (``T_target_source``).
+        fitness: share of the source's points with a target point within ``max_correspondence_distance``, in [0, 1].
+        inlier_rmse: root mean square distance of those pairs, in the input's units.
+        correspondence_set: (C, 2) rows of source and target of those pairs.
+        confidence: probability in [0, 1] that the transform is right.
+        max_correspondence_distance: the distance the above were measured at, in the input's units.
+        information: (6, 6) information matrix of the fine alignment, rotation before translation; zero if it was off.
+        matches: the network's weighted matches of key points.
+        model: name of the network's weights.
+        seconds: wall-clock time it took.
+    """
+
+    transformation: NDArray[np.float64]
+    fitness: float
+    inlier_rmse: float
+    correspondence_set: NDArray[np.int64]
+    confidence: float
+    max_correspondence_distance: float
+    information: NDArray[np.float64] = field(repr=False)
+    matches: Matches = field(repr=False)
+    model: str
+    seconds: float
+
+    def apply(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points (..., 3) of the source's frame, in the target's frame."""
+        return np.asarray(points, np.float64) @ self.transformation[:3, :3].T + self.transformation[:3, 3]
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the result as JSON (every field of :meth:`to_dict`), atomically; ``.txt`` writes the 4x4 alone.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        from idam.io import write_json, write_transform
+
+        if str(path).lower().endswith(".txt"):
+            write_transform(path, self.transformation)
+        else:
+            write_json(path, self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain numbers and lists, ready for JSON; without correspondences, which are large."""
+        return {
+            "transformation": self.transformation.tolist(),
+            "fitness": self.fitness,
+            "inlier_rmse": self.inlier_rmse,
+            "correspondences": len(self.correspondence_set),
+            "max_correspondence_distance": self.max_correspondence_distance,
+            "confidence": self.confidence,
+            "information": self.information.tolist(),
+            "model": self.model,
+            "seconds": self.seconds,
+        }
