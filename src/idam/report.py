@@ -71,7 +71,7 @@ def write_report(
         template,
         source_name=_escape(source_name),
         target_name=_escape(target_name),
-        confidence=_chance(result.confidence),
+        confidence=_escape(_chance(result.confidence)),
         confidence_percent=f"{100 * result.confidence:.1f}",
         level=level,
         verdict=verdict,
@@ -90,16 +90,17 @@ def write_report(
 
 
 def _headlines(result: RegistrationResult) -> str:
-    """The four figures at the top, as cards."""
+    """Lay out the four figures at the top as cards."""
     rotation = result.transformation[:3, :3]
     # the arc sine of the chord, unlike the arc cosine of the trace, is accurate for small angles too
     angle = 2 * math.asin(min(1.0, float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8)))
+    shift = float(np.linalg.norm(result.transformation[:3, 3]))
     distance = _number(result.max_correspondence_distance, 3)
     cards = [
         ("Fitness", f"{100 * result.fitness:.1f} %", f"of the source lies within {distance} of the target"),
         ("Inlier RMSE", _number(result.inlier_rmse, 3), "distance of those points, in the input’s unit"),
-        ("Rotation", f"{_number(math.degrees(angle))}°", "of the source, about one axis"),
-        ("Translation", _number(float(np.linalg.norm(result.transformation[:3, 3]))), "its length, in the input’s unit"),
+        ("Rotation", f"{_number(math.degrees(angle))}°", "angle, about one axis"),
+        ("Translation", _number(shift), "length, in the input’s unit"),
     ]
     return "\n".join(
         f'<div class="card"><h2>{label}</h2><p class="figure">{value}</p><p class="note">{note}</p></div>'
@@ -110,7 +111,7 @@ def _headlines(result: RegistrationResult) -> str:
 def _details(
     result: RegistrationResult, source: PointCloud, target: PointCloud, source_name: str, target_name: str
 ) -> str:
-    """The other figures, as the rows of a table."""
+    """Lay out the other figures as the rows of a table."""
     kept = int(np.count_nonzero(result.matches.weight))
     moved = result.apply(source.points.mean(axis=0)) - source.points.mean(axis=0)
     rows: _Rows = [
@@ -127,7 +128,7 @@ def _details(
 
 
 def _matrix(transformation: NDArray[np.float64]) -> str:
-    """The 4x4 as table rows, the translation with decimals to suit its size."""
+    """Lay out the 4x4 as table rows, the translation with decimals to suit its size."""
     largest = float(np.abs(transformation[:3, 3]).max())
     decimals = min(9, max(3, 6 - math.floor(math.log10(largest)))) if largest else 6
     rows = [[*(f"{value:.6f}" for value in row[:3]), f"{row[3]:.{decimals}f}"] for row in transformation[:3].tolist()]
@@ -143,34 +144,31 @@ def _count(shown: NDArray[np.float64], points: NDArray[np.float64]) -> str:
 
 
 def _verdict(confidence: float) -> tuple[str, str]:
-    """The bar's style and the sentence for a confidence."""
+    """Say what a confidence means: the style of its bar, and a sentence."""
     return next((level, verdict) for least, level, verdict in _VERDICTS if confidence >= least or least == 0)
 
 
 def _chance(confidence: float) -> str:
-    """A probability in whole per cent, never rounded to certainty."""
+    """Write a probability in whole per cent, never rounded to certainty."""
     if confidence > 0.99:
         return "> 99 %"
     return "< 1 %" if confidence < 0.01 else f"{100 * confidence:.0f} %"
 
 
 def _number(value: float, digits: int = 4) -> str:
-    """A number of any unit and size to that many significant digits."""
+    """Write a number of any unit and size to that many significant digits."""
     if not math.isfinite(value):
         return "n/a"
     magnitude = math.floor(math.log10(abs(value))) if value else 0
-    if not -5 <= magnitude <= 9:
-        text = f"{value:.{digits - 1}e}"
-    else:
-        text = f"{value:,.{max(0, digits - 1 - magnitude)}f}"
-    return text.replace("-", "−")
+    style = f",.{max(0, digits - 1 - magnitude)}f" if -5 <= magnitude <= 9 else f".{digits - 1}e"
+    return format(value, style).replace("-", "−")
 
 
 # The scene
 
 
 def _scene(source: NDArray[np.float64], target: NDArray[np.float64], result: RegistrationResult) -> dict[str, Any]:
-    """What the page's script draws, in coordinates around the target's centre.
+    """Gather what the page's script draws, in coordinates around the target's centre.
 
     A cloud's own coordinates are relative to its centre, so that float32 is enough for what was in metres of a
     national grid; the two poses of the source take its coordinates to the target's.
@@ -210,7 +208,7 @@ def _cloud(points: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _matches(matches: Matches, centres: list[NDArray[np.float64]]) -> dict[str, Any]:
-    """Matches from weak to strong, so that the strong are drawn last; each end relative to its cloud's centre."""
+    """Sort matches from weak to strong, so that the strong are drawn last; each end relative to its cloud's centre."""
     order = np.argsort(matches.weight, kind="stable")
     ends = [(matches.source - centres[0])[order], (matches.target - centres[1])[order]]
     return {
@@ -221,7 +219,7 @@ def _matches(matches: Matches, centres: list[NDArray[np.float64]]) -> dict[str, 
 
 
 def _approach(local: list[NDArray[np.float64]], offset: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
-    """The source's offset before, shortened where the clouds lie too far apart to be seen in one picture.
+    """Shorten the source's offset before where the clouds lie too far apart to be seen in one picture.
 
     Returns:
         The offset to draw, and the distance it stands for as text, empty where it is drawn as it is.
@@ -242,10 +240,10 @@ def _view(*clouds: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _up(points: NDArray[np.float64]) -> str:
-    """The axis that probably points up, to begin with: the page lets one choose another."""
+    """Guess the axis that points up, to begin with: the page lets one choose another."""
     low, high = np.percentile(points, [1, 99], axis=0)
     width, depth, height = high - low
-    if height < 0.5 * min(width, depth):
+    if height < 0.35 * min(width, depth):
         return "+z"  # flat: ground seen by a laser scanner
     if low[2] > 0 and max(np.abs([low[:2], high[:2]]).max(axis=0)) < high[2]:
         return "-y"  # in front of the origin: a depth camera's frame
@@ -253,7 +251,7 @@ def _up(points: NDArray[np.float64]) -> str:
 
 
 def _pose(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> list[list[float]]:
-    """The upper three rows of a 4x4."""
+    """Put the upper three rows of a 4x4 together."""
     rows: list[list[float]] = np.column_stack([rotation, translation]).tolist()
     return rows
 

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from idam.data.modelnet40 import Shapes, load
-from idam.data.pairs import Pairs, fixed_pairs, make_pairs
+from idam.data.modelnet40 import Shapes, experiment_shapes
+from idam.data.pairs import EXPERIMENTS, Pairs, experiment_noise, fixed_pairs, make_pairs
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform, gather_points
@@ -30,10 +30,8 @@ from idam.network.supervision import Loss, mutual_supervision
 
 __all__ = ["EXPERIMENTS", "Recipe", "train"]
 
-NOISE = 0.01
 VALIDATION_SHAPES = 200
 VALIDATION_SEED = 7
-EXPERIMENTS = ("unseen-shapes", "unseen-categories", "gaussian-noise")
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Recipe:
     @property
     def noise(self) -> float:
         """Sigma of the noise on both clouds."""
-        return NOISE if self.experiment == "gaussian-noise" else 0.0
+        return experiment_noise(self.experiment)
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the training, in [0, 1)."""
@@ -114,18 +112,6 @@ class SupervisedStep(nn.Module):
         return mutual_supervision(
             iterations, source, target, batch.rotation, batch.translation, *significance, self.radius
         )
-
-
-def experiment_shapes(experiment: str, folder: str | Path, split: str) -> Shapes:
-    """The shapes of an experiment's split: all 40 categories, or the first 20 to train and the last 20 to test.
-
-    Raises:
-        InputError: the folder does not hold ModelNet40.
-    """
-    shapes = load(folder, split)
-    if experiment != "unseen-categories":
-        return shapes
-    return shapes.select(shapes.labels < 20 if split == "train" else shapes.labels >= 20)
 
 
 @torch.inference_mode()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from idam.errors import InputError, MissingDependencyError
 
-__all__ = ["Shapes", "load"]
+__all__ = ["Shapes", "experiment_shapes", "load"]
 
 POINTS = 1024
 """Points used of each shape (section 4)."""
@@ -66,3 +66,15 @@ def load(folder: str | Path, split: str) -> Shapes:
     if not points:
         raise InputError(f"{index}: names no files; unpack the archive again")
     return Shapes(torch.from_numpy(np.concatenate(points)), torch.from_numpy(np.concatenate(labels)))
+
+
+def experiment_shapes(experiment: str, folder: str | Path, split: str) -> Shapes:
+    """The shapes of an experiment's split: all 40 categories, or the first 20 to train and the last 20 to test.
+
+    Raises:
+        InputError: the folder does not hold ModelNet40.
+    """
+    shapes = load(folder, split)
+    if experiment != "unseen-categories":
+        return shapes
+    return shapes.select(shapes.labels < 20 if split == "train" else shapes.labels >= 20)

@@ -10,8 +10,12 @@ from torch import Tensor
 
 from idam.geometry import apply_transform, euler_xyz_to_rotation, gather_points
 
-__all__ = ["Pairs", "fixed_pairs", "make_pairs"]
+__all__ = ["EXPERIMENTS", "Pairs", "experiment_noise", "fixed_pairs", "make_pairs"]
 
+EXPERIMENTS = ("unseen-shapes", "unseen-categories", "gaussian-noise")
+"""The paper's experiments (sections 4.1 to 4.3)."""
+
+NOISE = 0.01
 MAX_ANGLE = math.radians(45)
 MAX_TRANSLATION = 0.5
 CROPPED_POINTS = 768
@@ -48,6 +52,11 @@ class _Draw:
     order: Tensor
     noise: Tensor
     far: Tensor
+
+
+def experiment_noise(experiment: str) -> float:
+    """Sigma of an experiment's noise on every coordinate of both clouds."""
+    return NOISE if experiment == "gaussian-noise" else 0.0
 
 
 def make_pairs(points: Tensor, generator: torch.Generator, noise: float = 0.0) -> Pairs:

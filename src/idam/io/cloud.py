@@ -45,7 +45,7 @@ class PointCloud:
             object.__setattr__(self, "normals", normals)
 
     def transformed(self, transformation: ArrayLike) -> PointCloud:
-        """The cloud moved by a rigid transform (4, 4): points move, normals turn, colours stay."""
+        """Move the cloud by a rigid transform (4, 4): points move, normals turn, colours stay."""
         matrix = np.asarray(transformation, np.float64)
         rotation, translation = matrix[:3, :3], matrix[:3, 3]
         normals = None if self.normals is None else self.normals @ rotation.T
@@ -53,7 +53,7 @@ class PointCloud:
 
 
 def float_rows(data: Any, name: str) -> NDArray[np.float64]:
-    """``data`` as a float64 (N, 3) array; not copied if it is one already.
+    """Turn ``data`` into a float64 (N, 3) array; not copied if it is one already.
 
     Raises:
         InputError: it has another shape, or does not hold real numbers.

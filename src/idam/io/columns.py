@@ -11,12 +11,26 @@ from numpy.typing import NDArray
 from idam.errors import InputError
 from idam.io.cloud import PointCloud
 
-__all__ = ["check_size", "cloud_from_columns", "cloud_from_table", "finite_cloud", "has_positions", "parse_numbers", "positions"]
+__all__ = [
+    "Numbers",
+    "check_size",
+    "cloud_from_columns",
+    "cloud_from_table",
+    "finite_cloud",
+    "has_positions",
+    "parse_numbers",
+    "positions",
+]
 
 Numbers = NDArray[Any]
 
 _POSITIONS = (("x", "y", "z"), ("points:0", "points:1", "points:2"))
-_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_COLORS = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("rf", "gf", "bf"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normals:0", "normals:1", "normals:2"))
 
 # Where a colour or a normal may start in a table without names: x y z and a triple; x y z intensity and a triple (PTS);
@@ -25,13 +39,13 @@ _TRIPLES = {6: (3,), 7: (4,), 9: (3, 6)}
 
 
 def has_positions(names: list[str]) -> bool:
-    """Whether the names of columns say where the coordinates are."""
+    """Tell whether the names of columns say where the coordinates are."""
     known = {name.casefold() for name in names}
     return any(known.issuperset(triple) for triple in _POSITIONS)
 
 
 def cloud_from_columns(columns: Mapping[str, Numbers]) -> PointCloud:
-    """The cloud in named columns (N,), less the points that are not finite.
+    """Find the cloud in named columns (N,), less the points that are not finite.
 
     Raises:
         InputError: there are no coordinates, or no finite ones.
@@ -40,7 +54,7 @@ def cloud_from_columns(columns: Mapping[str, Numbers]) -> PointCloud:
 
 
 def positions(columns: Mapping[str, Numbers]) -> Numbers:
-    """The coordinates (N, 3) among named columns.
+    """Find the coordinates (N, 3) among named columns.
 
     Raises:
         InputError: there are none.
@@ -53,7 +67,7 @@ def positions(columns: Mapping[str, Numbers]) -> Numbers:
 
 
 def cloud_from_table(table: Numbers) -> PointCloud:
-    """The cloud in a table (N, 3 or more) without names: coordinates first, colours and normals where they look it.
+    """Find the cloud in a table (N, 3 or more) without names: coordinates, then what looks like colours or normals.
 
     Raises:
         InputError: there are no finite coordinates.
@@ -69,7 +83,7 @@ def cloud_from_table(table: Numbers) -> PointCloud:
 
 
 def finite_cloud(points: Numbers, colors: Numbers | None, normals: Numbers | None) -> PointCloud:
-    """The cloud less the points with a NaN or infinite coordinate, which depth cameras leave where they saw nothing.
+    """Leave out the points with a NaN or infinite coordinate, which depth cameras write where they saw nothing.
 
     Raises:
         InputError: no point is left.
@@ -87,7 +101,7 @@ def finite_cloud(points: Numbers, colors: Numbers | None, normals: Numbers | Non
 
 
 def parse_numbers(text: bytes) -> NDArray[np.float64]:
-    """All numbers of a text separated by white space, line ends included."""
+    """Read all numbers of a text separated by white space, line ends included."""
     return np.fromiter(map(float, text.split()), np.float64)
 
 

@@ -21,7 +21,7 @@ StrPath = str | os.PathLike[str]
 
 
 def read_bytes(path: StrPath) -> bytes:
-    """The contents of a file that is there, regular, readable and not empty.
+    """Read a file that is there, regular, readable and not empty.
 
     Raises:
         InputError: it is not.
@@ -109,7 +109,7 @@ def _plain(obj: Any) -> Any:
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, on one line of bearable length; its type if it says nothing."""
+    """Put what an exception says on one line of bearable length; its type if it says nothing."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return " ".join(str(error).split())[:160] or type(error).__name__

@@ -19,7 +19,7 @@ SAMPLES = 20_000
 
 
 def sample_surface(vertices: NDArray[Any], faces: NDArray[np.int64]) -> PointCloud:
-    """20,000 points spread evenly over the area of a mesh, with the normals of their faces; always the same ones.
+    """Spread 20,000 points evenly over the area of a mesh, with the normals of their faces; always the same ones.
 
     Args:
         vertices: (V, 3); faces on one that is not finite are left out.
@@ -42,13 +42,11 @@ def sample_surface(vertices: NDArray[Any], faces: NDArray[np.int64]) -> PointClo
     strata = (np.arange(SAMPLES) + random.random(SAMPLES)) / SAMPLES * cumulated[-1]
     chosen = np.searchsorted(cumulated, strata, side="right").clip(max=np.flatnonzero(areas)[-1])
     weights = _uniform_barycentric(random.random((2, SAMPLES)))
-    return PointCloud(
-        np.einsum("nk,nkc->nc", weights, corners[chosen]), normals=normals[chosen] / areas[chosen, None]
-    )
+    return PointCloud(np.einsum("nk,nkc->nc", weights, corners[chosen]), normals=normals[chosen] / areas[chosen, None])
 
 
 def fan(polygons: NDArray[Any]) -> NDArray[np.int64]:
-    """Polygons (F, n) of as many corners each, cut into triangles (T, 3) that share their first corner."""
+    """Cut polygons (F, n) of as many corners each into triangles (T, 3) that share their first corner."""
     corners = polygons.astype(np.int64)
     return np.concatenate(
         [np.empty((0, 3), np.int64), *(corners[:, [0, i, i + 1]] for i in range(1, corners.shape[1] - 1))]
@@ -56,24 +54,24 @@ def fan(polygons: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def triangles(polygons: list[NDArray[Any]]) -> NDArray[np.int64]:
-    """Polygons of any number of corners, cut into triangles (T, 3)."""
+    """Cut polygons of any number of corners into triangles (T, 3)."""
     lengths = np.array([len(polygon) for polygon in polygons])
     alike = [np.stack([polygons[row] for row in np.flatnonzero(lengths == n)]) for n in np.unique(lengths)]
     return np.concatenate([fan(each) for each in alike])
 
 
 def decode_obj(data: bytes) -> PointCloud:
-    """The surface of a Wavefront OBJ mesh, or its vertices if it has no faces."""
+    """Sample the surface of a Wavefront OBJ mesh, or take its vertices if it has no faces."""
     return _decode(data, "obj")
 
 
 def decode_off(data: bytes) -> PointCloud:
-    """The surface of an OFF mesh, or its vertices if it has no faces."""
+    """Sample the surface of an OFF mesh, or take its vertices if it has no faces."""
     return _decode(data, "off")
 
 
 def decode_stl(data: bytes) -> PointCloud:
-    """The surface of an STL mesh, ASCII or binary."""
+    """Sample the surface of an STL mesh, ASCII or binary."""
     return _decode(data, "stl")
 
 
@@ -82,10 +80,10 @@ def _decode(data: bytes, file_type: str) -> PointCloud:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        loaded = trimesh.load(io.BytesIO(data), file_type=file_type, process=False)
+        loaded: Any = trimesh.load(io.BytesIO(data), file_type=file_type, process=False)
     parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
-    vertices = np.concatenate([np.empty((0, 3))] + [part.vertices for part in parts])
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts)], dtype=np.int64)
+    vertices = np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False) if hasattr(part, "faces")]
     if sum(map(len, faces)):
         return sample_surface(vertices, np.concatenate(faces))
@@ -93,6 +91,6 @@ def _decode(data: bytes, file_type: str) -> PointCloud:
 
 
 def _uniform_barycentric(random: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Barycentric coordinates (N, 3), uniform over the triangle, from uniform numbers (2, N) of [0, 1)."""
+    """Turn uniform numbers (2, N) of [0, 1) into barycentric coordinates (N, 3), uniform over the triangle."""
     root = np.sqrt(random[0])
     return np.stack([1 - root, root * (1 - random[1]), root * random[1]], axis=1)

@@ -30,7 +30,7 @@ class _Header:
 
 
 def decode(data: bytes) -> PointCloud:
-    """The points of a PCD file.
+    """Read the points of a PCD file.
 
     Raises:
         InputError: the file is damaged, or has no finite coordinates.
@@ -46,7 +46,7 @@ def decode(data: bytes) -> PointCloud:
 
 
 def encode(cloud: PointCloud, coordinates: str) -> bytes:
-    """A binary PCD file with coordinates of type ``f4`` or ``f8``."""
+    """Encode a binary PCD file with coordinates of type ``f4`` or ``f8``."""
     names, types, columns = ["x", "y", "z"], [coordinates] * 3, [*cloud.points.T]
     if cloud.normals is not None:
         names += ["normal_x", "normal_y", "normal_z"]
@@ -99,7 +99,7 @@ def _read_ascii(header: _Header, body: bytes) -> list[NDArray[Any]]:
 
 
 def _as_declared(values: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Integers as integers, and the floats that may hold a packed colour as such; doubles as they are."""
+    """Turn numbers read as doubles into the integers they are declared as; a float keeps the digits of the text."""
     return values.astype(np.int64).astype(kind) if kind.kind != "f" else values
 
 
@@ -112,7 +112,7 @@ def _read_binary(header: _Header, body: bytes) -> list[NDArray[Any]]:
 
 
 def _read_compressed(header: _Header, body: bytes) -> list[NDArray[Any]]:
-    """Compressed data hold one field after the other, not one point after the other."""
+    """Read compressed data, which hold one field after the other, not one point after the other."""
     check_size(8, len(body), "compressed data")
     packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
     check_size(packed, len(body) - 8, "compressed data")
@@ -133,7 +133,7 @@ def _check_binary_size(header: _Header, available: int) -> None:
 
 
 def _decompress_lzf(data: bytes, size: int) -> bytes:
-    """LZF: runs of literal bytes, and references (length, distance) to what came before."""
+    """Unpack LZF: runs of literal bytes, and references (length, distance) to what came before."""
     out = bytearray()
     at = 0
     while at < len(data) and len(out) <= size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,10 +17,15 @@ from idam.io.mesh import fan, sample_surface, triangles
 
 __all__ = ["decode", "encode"]
 
-_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
-    **{"double": "f8", "float64": "f8"},
+_C_NAMES = {
+    "char": "int8",
+    "uchar": "uint8",
+    "short": "int16",
+    "ushort": "uint16",
+    "int": "int32",
+    "uint": "uint32",
+    "float": "float32",
+    "double": "float64",
 }
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|$)")
 
@@ -42,7 +48,7 @@ class _Element:
 
 
 def decode(data: bytes) -> PointCloud:
-    """The points of a PLY file; if it has faces, points sampled on their surface.
+    """Read the points of a PLY file; if it has faces, sample points on their surface.
 
     Raises:
         InputError: the file is damaged, or has no vertices.
@@ -62,7 +68,7 @@ def decode(data: bytes) -> PointCloud:
 
 
 def encode(cloud: PointCloud, coordinates: str) -> bytes:
-    """A binary little endian PLY file with coordinates of type ``f4`` or ``f8``."""
+    """Encode a binary little endian PLY file with coordinates of type ``f4`` or ``f8``."""
     names = {"f4": "float", "f8": "double", "u1": "uchar"}
     fields = [(name, coordinates) for name in ("x", "y", "z")]
     columns = [*cloud.points.T]
@@ -81,13 +87,13 @@ def encode(cloud: PointCloud, coordinates: str) -> bytes:
 
 
 def _parse_header(data: bytes) -> tuple[list[_Element], bool, int]:
-    """The elements, whether they are written as text, and where they start."""
+    """Find the elements, whether they are written as text, and where they start."""
     end = _END_OF_HEADER.search(data)
     if not data.startswith((b"ply\n", b"ply\r", b"ply ")) or end is None:
         raise InputError("not a PLY file (no 'ply' ... 'end_header'): check what it is")
     order = None
     elements: list[_Element] = []
-    for line in data[: end.start()].decode("latin-1").splitlines()[1:]:
+    for line in re.split("[\r\n]+", data[: end.start()].decode("latin-1"))[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 pass
@@ -107,16 +113,19 @@ def _parse_header(data: bytes) -> tuple[list[_Element], bool, int]:
 
 
 def _property(name: str, order: str, kind: str, count_type: str | None = None) -> _Property:
-    def dtype(kind: str) -> np.dtype[Any]:
-        if kind not in _TYPES:
-            raise InputError(f"damaged: its header has the unknown type '{kind[:60]}': export it again")
-        return np.dtype(order + _TYPES[kind] if order else "<f8")
+    counts = _type(count_type, order) if count_type else None
+    return _Property(name, _type(kind, order), "int" in _C_NAMES.get(kind, kind), counts)
 
-    return _Property(name, dtype(kind), _TYPES[kind][0] != "f", count_type and dtype(count_type))
+
+def _type(name: str, order: str) -> np.dtype[Any]:
+    name = _C_NAMES.get(name, name)
+    if name not in _C_NAMES.values():
+        raise InputError(f"damaged: its header has the unknown type '{name[:60]}': export it again")
+    return np.dtype(order + np.dtype(name).str[1:] if order else "<f8")
 
 
 def _read_element(data: bytes, offset: int, element: _Element, unit: str) -> tuple[dict[str, Column], int]:
-    """The element's columns, and where the next one starts."""
+    """Read the element's columns, and find where the next one starts."""
     size = 8 if unit == "numbers" else 1
     least = element.count * sum((each.count_type or each.type).itemsize for each in element.properties)
     check_size(least // size, (len(data) - offset) // size, f"{element.count:,} rows of '{element.name}'", unit)
@@ -128,8 +137,8 @@ def _read_element(data: bytes, offset: int, element: _Element, unit: str) -> tup
         rows = np.frombuffer(data, layout, element.count, offset)
         lengths = [rows[name] for name in layout.names or () if name.startswith("length")]
         if all((each == each[0]).all() for each in lengths):
-            columns = {each.name: rows[f"values{index}"] for index, each in enumerate(element.properties)}
-            return _integers(columns, element), offset + rows.nbytes
+            columns = [rows[f"values{index}"] for index in range(len(element.properties))]
+            return _named(columns, element), offset + rows.nbytes
     return _read_rows(data, offset, element)
 
 
@@ -147,22 +156,30 @@ def _layout_of_first_row(data: bytes, offset: int, element: _Element) -> np.dtyp
 
 
 def _read_rows(data: bytes, offset: int, element: _Element) -> tuple[dict[str, Column], int]:
-    """As :func:`_read_element`, where lists differ in length."""
-    lists: dict[str, list[NDArray[Any]]] = {each.name: [] for each in element.properties}
+    """Do as :func:`_read_element` where lists differ in length."""
+    lists: list[list[NDArray[Any]]] = [[] for _ in element.properties]
     for _ in range(element.count):
-        for each in element.properties:
+        for each, values in zip(element.properties, lists, strict=True):
             length, offset = (1, offset) if each.count_type is None else _read_length(data, offset, each)
-            lists[each.name].append(np.frombuffer(data, each.type, length, offset))
+            values.append(np.frombuffer(data, each.type, length, offset))
             offset += length * each.type.itemsize
-    columns: dict[str, Column] = {
-        each.name: np.concatenate(lists[each.name]) if each.count_type is None else lists[each.name]
-        for each in element.properties
-    }
-    return _integers(columns, element), offset
+    properties = zip(element.properties, lists, strict=True)
+    columns = [np.concatenate(values) if each.count_type is None else values for each, values in properties]
+    return _named(columns, element), offset
+
+
+def _named(columns: Sequence[Column], element: _Element) -> dict[str, Column]:
+    """Name the columns, and make integers again of what the text of an ASCII file was read as."""
+    named: dict[str, Column] = {}
+    for each, column in zip(element.properties, columns, strict=True):
+        if each.is_integer and isinstance(column, np.ndarray) and column.dtype.kind == "f":
+            column = column.astype(np.int64)
+        named[each.name] = column
+    return named
 
 
 def _read_length(data: bytes, offset: int, each: _Property) -> tuple[int, int]:
-    """The length of a list, and where its values start."""
+    """Read the length of a list, and find where its values start."""
     assert each.count_type is not None
     length = int(np.frombuffer(data, each.count_type, 1, offset)[0])
     offset += each.count_type.itemsize

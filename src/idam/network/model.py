@@ -12,7 +12,7 @@ from idam.network.elimination import Significance, Validity, hybrid_weights, kee
 from idam.network.features import build_features
 from idam.network.similarity import SimilarityConvolution
 
-__all__ = ["IDAM", "Config", "Iteration", "Output"]
+__all__ = ["IDAM", "Config", "Iteration", "KeyPoints", "Output"]
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,23 @@ class Iteration:
 
 
 @dataclass(frozen=True)
+class KeyPoints:
+    """What hard elimination leaves of B clouds of N points.
+
+    Attributes:
+        points: (B, M, 3).
+        features: (B, M, K).
+        index: their rows in the cloud, (B, M).
+        significance: s(i) of every point of the cloud, (B, N).
+    """
+
+    points: Tensor
+    features: Tensor
+    index: Tensor
+    significance: Tensor
+
+
+@dataclass(frozen=True)
 class Output:
     """The registration of B pairs.
 
@@ -88,19 +105,15 @@ class Output:
         rotation: (B, 3, 3), of the whole transform from source to target.
         translation: (B, 3).
         iterations: what each iteration saw and did.
-        source_index: rows (B, M) of the source that hard elimination kept.
-        target_index: rows (B, L) of the target that hard elimination kept.
-        source_significance: s(i) of every source point, (B, N).
-        target_significance: s(j) of every target point, (B, P).
+        source: its key points, where it was given.
+        target: its key points.
     """
 
     rotation: Tensor
     translation: Tensor
     iterations: list[Iteration]
-    source_index: Tensor
-    target_index: Tensor
-    source_significance: Tensor
-    target_significance: Tensor
+    source: KeyPoints
+    target: KeyPoints
 
 
 class IDAM(nn.Module):
@@ -118,10 +131,10 @@ class IDAM(nn.Module):
         self.validity = nn.ModuleList(Validity(self.config.channels) for _ in range(self.config.blocks))
 
     def forward(self, source: Tensor, target: Tensor) -> Output:
-        """Register batches of clouds: the transform that lays each source on its target (algorithm of figure 2).
+        """Register batches of clouds: the transform that lays each source on its target (figure 2).
 
         Args:
-            source: (B, N, 3), centred and scaled like the training data (about the unit sphere).
+            source: (B, N, 3), scaled like the training data (about the unit sphere).
             target: (B, P, 3); P may differ from N.
 
         Returns:
@@ -129,20 +142,7 @@ class IDAM(nn.Module):
             the transform is not: no gradient passes the SVD (section 3.4).
         """
         source_features, target_features = self.encode(source, target)
-        source_significance = self.significance(source_features)
-        target_significance = self.significance(target_features)
-        source_index = keep_most_significant(source_significance, self.config.keep)
-        target_index = keep_most_significant(target_significance, self.config.keep)
-        iterations = self.iterate(
-            gather_points(source, source_index),
-            gather_points(target, target_index),
-            gather_points(source_features, source_index),
-            gather_points(target_features, target_index),
-        )
-        rotation, translation = chain(iterations)
-        return Output(
-            rotation, translation, iterations, source_index, target_index, source_significance, target_significance
-        )
+        return self.match(self.eliminate(source, source_features), self.eliminate(target, target_features))
 
     def encode(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, N, K) and (B, P, K) of both clouds; equally large clouds go through as one batch."""
@@ -150,6 +150,17 @@ class IDAM(nn.Module):
             source_features, target_features = self.features(torch.cat([source, target])).chunk(2)
             return source_features, target_features
         return self.features(source), self.features(target)
+
+    def eliminate(self, points: Tensor, features: Tensor) -> KeyPoints:
+        """Hard elimination: the most significant of the points (B, N, 3) with features (B, N, K)."""
+        significance = self.significance(features)
+        index = keep_most_significant(significance, self.config.keep)
+        return KeyPoints(gather_points(points, index), gather_points(features, index), index, significance)
+
+    def match(self, source: KeyPoints, target: KeyPoints) -> Output:
+        """Register key points: :meth:`forward` from hard elimination on."""
+        iterations = self.iterate(source.points, target.points, source.features, target.features)
+        return Output(*chain(iterations), iterations, source, target)
 
     def iterate(
         self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor

@@ -8,14 +8,22 @@ points.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["Neighbours", "Reach", "by_memory", "estimate_normals", "find_neighbours", "normals_from_neighbours"]
+__all__ = [
+    "Neighbours",
+    "Reach",
+    "estimate_normals",
+    "find_neighbours",
+    "in_parts",
+    "normal_reach",
+    "normals_from_neighbours",
+]
 
 # Entries of the largest distance matrix held at a time: bounds memory, and keeps the matrix in the processor's cache.
 DISTANCES = 2**21
@@ -24,6 +32,8 @@ FEWEST_POINTS = 3
 # A neighbourhood is a line where its second variance is below this fraction of the first. The roots of the closed form
 # are good to the square root of float64's precision there, 1e-8.
 LINE = 1e-6
+# A neighbourhood is a single place where its variance is below this fraction of the cloud's: float32's resolution.
+PLACE = 1e-12
 # How far off the centroid the normals' viewpoint lies, as a fraction of the cloud's root mean square radius.
 OFF_CENTRE = 1e-3
 
@@ -42,32 +52,43 @@ class Neighbours(NamedTuple):
     Attributes:
         centre: (E,), row in 0 .. P - 1 of the point whose neighbour it is.
         neighbour: (E,), row of the neighbour, a point of the same cloud and never the point itself.
-        count: (P,), how many neighbours each point has.
+        counts: (P,), how many neighbours each point has.
     """
 
     centre: Tensor
     neighbour: Tensor
-    count: Tensor
+    counts: Tensor
 
     def sum(self, values: Tensor, weight: Tensor | None = None) -> Tensor:
         """Sum over each point's neighbours j of ``weight`` (E,) times row j of ``values`` (P, C): (P, C)."""
-        start = self.count.cumsum(0) - self.count
+        start = self.counts.cumsum(0) - self.counts
         return F.embedding_bag(self.neighbour, values, start, mode="sum", per_sample_weights=weight)
 
 
-def by_memory(points: Tensor) -> Iterator[slice]:
-    """Ranges of clouds of ``points`` (B, N, 3), together the batch, each small enough to be worked on at a time."""
-    batch, size, _ = points.shape
-    step = max(1, DISTANCES // max(1, size * size))
-    for start in range(0, batch, step):
-        yield slice(start, start + step)
+def in_parts(function: Callable[..., Tensor], points: Tensor, *others: Tensor) -> Tensor:
+    """Apply a function of clouds to a batch of them, so many at a time as memory bounds allow, in float32 or float64.
+
+    Args:
+        function: takes parts (b, N, 3) of ``points`` and ``others``, and returns (b, N, C).
+        points: (B, N, 3), of any floating dtype.
+        others: more of the same shape.
+
+    Returns:
+        (B, N, C), in the dtype of ``points``.
+    """
+    if points.dim() != 3 or points.shape[-1] != 3:
+        raise ValueError(f"points must be (B, N, 3), got {tuple(points.shape)}")
+    dtype = torch.promote_types(points.dtype, torch.float32)
+    step = max(1, DISTANCES // points.shape[1] ** 2)
+    parts = zip(*(torch.split(clouds, step) for clouds in (points, *others)), strict=True)
+    return torch.cat([function(*(clouds.to(dtype) for clouds in part)) for part in parts]).to(points.dtype)
 
 
 def find_neighbours(points: Tensor, *reaches: Reach) -> list[Neighbours]:
-    """The neighbours of every point in its own cloud, for each of the ``reaches``.
+    """Find the neighbours of every point in its own cloud, for each of the ``reaches``.
 
     Args:
-        points: (B, N, 3), a part of the batch as ``by_memory`` deals them out: one cloud, or several small ones.
+        points: (B, N, 3), a part of the batch as ``in_parts`` deals them out: one cloud, or several small ones.
         reaches: the searches to do; they share the distances.
     """
     batch, size, _ = points.shape
@@ -87,8 +108,8 @@ def _select(distance: Tensor, reach: Reach) -> Tensor:
     """Which entries of ``distance`` (P, N) are within reach of their row's point: (P, N) bool."""
     chosen = distance < reach.radius
     count = chosen.sum(-1, dtype=torch.int32)
-    at_least = min(reach.at_least, distance.shape[-1] - 1)
-    for wrong, k in ((count > reach.at_most, reach.at_most), (count < at_least, at_least)):
+    at_most, at_least = (min(bound, distance.shape[-1] - 1) for bound in (reach.at_most, reach.at_least))
+    for wrong, k in ((count > at_most, at_most), (count < at_least, at_least)):
         row = wrong.nonzero().squeeze(1)
         nearest = distance[row].topk(k, largest=False, sorted=False).indices
         chosen[row] = False
@@ -125,24 +146,21 @@ def estimate_normals(points: Tensor, *, radius: float, max_neighbours: int) -> T
     Returns:
         Unit normals (B, N, 3), without gradient.
     """
-    points, dtype = points.detach().to(torch.promote_types(points.dtype, torch.float32)), points.dtype
     reach = normal_reach(radius, max_neighbours)
-    normals = torch.empty_like(points)
-    for part in by_memory(points):
-        (near,) = find_neighbours(points[part], reach)
-        normals[part] = normals_from_neighbours(points[part], near)
-    return normals.to(dtype)
+    return in_parts(lambda cloud: normals_from_neighbours(cloud, *find_neighbours(cloud, reach)), points)
 
 
 def normal_reach(radius: float, max_neighbours: int) -> Reach:
-    """The search for a normal's neighbourhood of at most ``max_neighbours`` points, the point itself included."""
+    """Search for a normal's neighbourhood of at most ``max_neighbours`` points, the point itself included."""
     return Reach(radius, at_most=max_neighbours - 1, at_least=FEWEST_POINTS - 1)
 
 
 def normals_from_neighbours(points: Tensor, near: Neighbours) -> Tensor:
     """Outward unit normals (B, N, 3) of ``points`` (B, N, 3) from their neighbourhoods."""
     centred = points.double() - points.double().mean(-2, keepdim=True)
-    centred = centred / centred.square().sum(-1).mean(-1).sqrt().clamp_min(torch.finfo(points.dtype).tiny)[:, None, None]
+    centred = (
+        centred / centred.square().sum(-1).mean(-1).sqrt().clamp_min(torch.finfo(points.dtype).tiny)[:, None, None]
+    )
     outward = (centred - OFF_CENTRE * _asymmetry(centred)).flatten(0, 1)
     normal = _least_variance(_covariance(centred.flatten(0, 1), near), outward)
     inward = (normal * outward).sum(-1, keepdim=True) < 0
@@ -150,26 +168,28 @@ def normals_from_neighbours(points: Tensor, near: Neighbours) -> Tensor:
 
 
 def _asymmetry(centred: Tensor) -> Tensor:
-    """A vector (B, 1, 3) that turns with the cloud ``centred`` (B, N, 3), and that leaves the plane of a flat cloud.
+    """Vector (B, 1, 3) that turns with the cloud ``centred`` (B, N, 3), and that leaves the plane of a flat cloud.
 
     With a = mean |p|^2 p and b = mean |p|^4 p, it is a / |a| + (a x b) / |a x b|.
     """
     square = centred.square().sum(-1, keepdim=True)
     third, fifth = (square * centred).mean(-2), (square.square() * centred).mean(-2)
-    return (F.normalize(third, dim=-1) + F.normalize(torch.linalg.cross(third, fifth), dim=-1)).unsqueeze(-2)
+    return (_unit(third) + _unit(torch.linalg.cross(third, fifth))).unsqueeze(-2)
 
 
 def _covariance(points: Tensor, near: Neighbours) -> Tensor:
     """Covariance (P, 3, 3) of each of the ``points`` (P, 3) together with its neighbours."""
     product = points.unsqueeze(-1) * points.unsqueeze(-2)
     moments = torch.cat([points, product.flatten(1)], -1)
-    moments = (moments + near.sum(moments)) / (1 + near.count).unsqueeze(-1)
-    mean, square = moments[:, :3], moments[:, 3:].unflatten(1, (3, 3))
-    return square - mean.unsqueeze(-1) * mean.unsqueeze(-2)
+    moments = (moments + near.sum(moments)) / (1 + near.counts).unsqueeze(-1)
+    mean, square = moments[:, :3], moments[:, 3:].view(-1, 3, 3)
+    covariance = square - mean.unsqueeze(-1) * mean.unsqueeze(-2)
+    is_place = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) < PLACE
+    return covariance.masked_fill(is_place[:, None, None], 0)
 
 
 def _least_variance(covariance: Tensor, outward: Tensor) -> Tensor:
-    """The eigenvector (P, 3) of the smallest eigenvalue of ``covariance`` (P, 3, 3), of either sign.
+    """Eigenvector (P, 3) of the smallest eigenvalue of ``covariance`` (P, 3, 3), of either sign.
 
     In closed form, thirty times as fast as ``torch.linalg.eigh``. C - l I, with l the smallest eigenvalue, has its rows
     in the plane of the other two eigenvectors, so the eigenvector is the cross product of two rows, the two that give
@@ -178,9 +198,39 @@ def _least_variance(covariance: Tensor, outward: Tensor) -> Tensor:
     """
     rows = covariance - _smallest_eigenvalue(covariance)[:, None, None] * torch.eye(3).to(covariance)
     normal = _longest(torch.linalg.cross(rows, rows.roll(1, -2)))
-    row = F.normalize(_longest(rows), dim=-1)
+    is_plane = normal.norm(dim=-1, keepdim=True) > LINE * rows.square().sum((-2, -1)).unsqueeze(-1)
+    row = _unit(_longest(rows))
     axis = F.one_hot(row.abs().argmin(-1), 3).to(row)
-    across, aside = _without(outward, row), _without(axis, row)
-    across = torch.where(_is_small(across, outward), aside, across)
-    is_line = normal.norm(dim=-1, keepdim=True) <= LINE * rows.square().sum((-2, -1)).unsqueeze(-1)
-    return F.normalize(torch.where(is_line, across, normal), dim=-1, eps=torch.finfo(normal.dtype).tiny)
+    across = _without(outward, row)
+    is_outward = across.norm(dim=-1, keepdim=True) > LINE * outward.norm(dim=-1, keepdim=True)
+    return _unit(torch.where(is_plane, normal, torch.where(is_outward, across, _without(axis, row))))
+
+
+def _smallest_eigenvalue(matrix: Tensor) -> Tensor:
+    """Smallest eigenvalue (P,) of symmetric matrices A (P, 3, 3), by the trigonometric solution of the cubic.
+
+    q + 2 p cos(arccos(det((A - q I) / p) / 2) / 3 + 2 pi / 3), q = tr(A) / 3, p^2 = |A - q I|^2 / 6.
+    """
+    mean = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)
+    deviator = matrix - mean[:, None, None] * torch.eye(3).to(matrix)
+    spread = (deviator.square().sum((-2, -1)) / 6).sqrt()
+    deviator = deviator / spread.clamp_min(torch.finfo(matrix.dtype).tiny)[:, None, None]
+    determinant = (deviator[:, 0] * torch.linalg.cross(deviator[:, 1], deviator[:, 2])).sum(-1)
+    angle = (determinant / 2).clamp(-1, 1).acos() / 3
+    return mean + 2 * spread * (angle + 2 * math.pi / 3).cos()
+
+
+def _longest(vectors: Tensor) -> Tensor:
+    """Longest (P, 3) of three vectors (P, 3, 3), given as rows."""
+    index = vectors.square().sum(-1).argmax(-1)
+    return vectors[torch.arange(len(vectors), device=vectors.device), index]
+
+
+def _unit(vector: Tensor) -> Tensor:
+    """Vectors (..., 3) scaled to length one, zero vectors left as they are."""
+    return F.normalize(vector, dim=-1, eps=torch.finfo(vector.dtype).tiny)
+
+
+def _without(vector: Tensor, direction: Tensor) -> Tensor:
+    """Vectors (P, 3) less their part along a unit or zero ``direction`` (P, 3)."""
+    return vector - (vector * direction).sum(-1, keepdim=True) * direction

@@ -1,0 +1,5 @@
+"""``python -m idam`` and ``torchrun -m idam``."""
+
+from idam.cli import main
+
+main()

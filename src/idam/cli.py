@@ -1,0 +1,326 @@
+"""The command line: parse, call, print. Everything heavy is imported by the command that needs it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from idam import __version__
+from idam.errors import InputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from idam.evaluation.experiments import Row
+    from idam.result import RegistrationResult
+
+__all__ = ["main"]
+
+UNSURE = 1
+BAD_INPUT = 2
+CONFIDENT = 0.5
+"""Confidence below which ``idam register`` exits with 1."""
+
+app = typer.Typer(
+    name="idam",
+    help="Learned global registration of partially overlapping 3D point clouds.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+Data = Annotated[Path, typer.Option("--data", help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")]
+Json = Annotated[Path | None, typer.Option("--json", help="Also write the figures to this JSON file.")]
+
+
+def main() -> NoReturn:
+    """Run the command line; bad input ends in one line on stderr and exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except (InputError, MissingDependencyError) as error:
+        stop(str(error), BAD_INPUT)
+    except (KeyboardInterrupt, typer.Abort):
+        stop("interrupted", 130)
+    except Exception as error:
+        usage = getattr(error, "format_message", None)  # what the parser raises for a wrong call
+        if usage is None:
+            raise
+        stop(f"{usage()} See 'idam --help'.", BAD_INPUT)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def stop(message: str, code: int) -> NoReturn:
+    """Print one line on stderr and exit."""
+    print("idam: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(code)
+
+
+@app.callback(invoke_without_command=True)
+def about(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    """Learned global registration of partially overlapping 3D point clouds."""
+    if version:
+        print(f"idam {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def register(
+    source: Annotated[Path, typer.Argument(help="The cloud to move.")],
+    target: Annotated[Path, typer.Argument(help="The cloud to lay it on.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the moved source here, colours and normals kept.")
+    ] = None,
+    transform: Annotated[Path | None, typer.Option(help="Write the 4x4 here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the whole result here.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write a page to look at the result, opens offline.")] = None,
+    model: Annotated[str, typer.Option(help="Name or file of the weights; see 'idam models'.")] = "default",
+    init: Annotated[Path | None, typer.Option(help="File of a 4x4 to start from.")] = None,
+    voxel_size: Annotated[float | None, typer.Option(help="Resolution for the network; from the data if left out.")] = None,
+    max_correspondence_distance: Annotated[
+        float | None, typer.Option(help="Distance for fitness and RMSE; from the data if left out.")
+    ] = None,
+    refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point or none.")] = "gicp",
+    seed: Annotated[int, typer.Option(help="Of the starting rotations.")] = 0,
+    device: Annotated[str, typer.Option(help="Where the network runs.")] = "cpu",
+) -> None:
+    """Lay SOURCE on TARGET: print the transform and how sure it is.
+
+    The files may be PLY, PCD, XYZ, TXT, CSV, PTS, NPY, NPZ, OBJ, STL, OFF, LAS or LAZ. The exit code is 0 for a
+    confident answer, 1 for one that is likely wrong and 2 for bad input.
+
+    [bold]Examples[/bold]
+
+      idam register scan1.ply scan2.ply
+
+      idam register scan1.ply scan2.ply -o aligned.ply --transform T.txt --html look.html
+    """
+    from idam import registration
+    from idam.io import read_point_cloud, read_transform, write_point_cloud, write_transform
+
+    source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
+    result = registration.register(
+        source_cloud,
+        target_cloud,
+        model=model,
+        init=None if init is None else read_transform(init),
+        voxel_size=voxel_size,
+        max_correspondence_distance=max_correspondence_distance,
+        refine=refine,
+        seed=seed,
+        device=device,
+    )
+    if output is not None:
+        write_point_cloud(output, source_cloud.transformed(result.transformation))
+    if transform is not None:
+        write_transform(transform, result.transformation)
+    if json is not None:
+        result.save(json)
+    if html is not None:
+        from idam.report import write_report
+
+        write_report(html, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
+    show(result)
+    if result.confidence < CONFIDENT:
+        raise typer.Exit(UNSURE)
+
+
+def show(result: RegistrationResult) -> None:
+    """Print a result: the 4x4 as CloudCompare takes it, then the figures."""
+    from idam.io import format_transform
+
+    print(format_transform(result.transformation))
+    print(f"fitness     {result.fitness:.3f}  (within {result.max_correspondence_distance:.4g})")
+    print(f"inlier RMSE {result.inlier_rmse:.4g}")
+    print(f"confidence  {result.confidence:.2f}")
+    print(f"time        {result.seconds:.2f} s")
+
+
+@app.command()
+def models() -> None:
+    """List the shipped models: what they were trained on and how they did."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from idam.network.pretrained import list_models, provenance
+
+    table = Table("model", "features", "experiment", "iterations", "steps", "seed", "RMSE(R)", "MAE(R)", "commit")
+    for name in list_models():
+        history = provenance(name)
+        scores = history.get("validation", {})
+        table.add_row(
+            name,
+            history["config"]["features"],
+            history.get("experiment", ""),
+            str(history["config"]["iterations"]),
+            str(history.get("steps", "")),
+            str(history.get("recipe", {}).get("seed", "")),
+            f"{scores.get('rmse_r', float('nan')):.3f}",
+            f"{scores.get('mae_r', float('nan')):.3f}",
+            history.get("commit", ""),
+        )
+        table.add_row("", "", f"[dim]{history.get('command', '')}[/dim]", end_section=True)
+    console = Console()
+    console.print(table)
+    console.print("Errors in degrees, network alone, on shapes held out of the training split.")
+
+
+@app.command()
+def train(
+    experiment: Annotated[str, typer.Argument(help="unseen-shapes, unseen-categories or gaussian-noise.")],
+    data: Data,
+    features: Annotated[str, typer.Option(help="Point features: gnn or fpfh.")] = "gnn",
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the weights and the log.")] = None,
+    epochs: Annotated[float, typer.Option(help="Passes over the training shapes; may be a fraction.")] = 40,
+    batch_size: Annotated[int, typer.Option(help="Pairs a step, over all processes.")] = 16,
+    schedule: Annotated[str, typer.Option(help="step (the paper's) or one-cycle.")] = "step",
+    learning_rate: Annotated[float, typer.Option(help="Adam's, at its highest.")] = 1e-4,
+    seed: Annotated[int, typer.Option(help="Of the weights, pairs and samples.")] = 0,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    precision: Annotated[str, typer.Option(help="32 or bf16.")] = "32",
+    validate_every: Annotated[int, typer.Option(help="Steps between checkpoints.")] = 250,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
+) -> None:
+    """Train a model; the defaults are the paper's recipe. Under torchrun it uses every process.
+
+    [bold]Examples[/bold]
+
+      idam train unseen-shapes --data modelnet40
+
+      idam train gaussian-noise --data modelnet40 --epochs 4 --schedule one-cycle --learning-rate 1e-3 --precision bf16
+
+      torchrun --nproc-per-node 4 -m idam train unseen-shapes --data modelnet40
+    """
+    from idam.network.model import Config
+    from idam.training import Recipe
+    from idam.training import train as run
+
+    recipe = Recipe(
+        experiment=experiment,
+        config=Config(features=features),
+        epochs=epochs,
+        batch_size=batch_size,
+        schedule=schedule,
+        learning_rate=learning_rate,
+        seed=seed,
+    )
+    best = run(
+        recipe,
+        data,
+        output or Path("runs") / f"{features}-{experiment}",
+        resume=resume,
+        device=device,
+        precision=precision,
+        validate_every=validate_every,
+        command=shlex.join(["idam", *sys.argv[1:]]),
+    )
+    print(f"best model: {best}")
+
+
+@app.command()
+def evaluate(
+    experiment: Annotated[
+        str | None, typer.Argument(help="unseen-shapes, unseen-categories or gaussian-noise; or give --pairs.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")] = None,
+    pairs: Annotated[Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t.")] = None,
+    method: Annotated[list[str] | None, typer.Option(help="Rows to compute; all if left out.")] = None,
+    model: Annotated[str | None, typer.Option(help="Weights for the idam rows.")] = None,
+    limit: Annotated[int | None, typer.Option(help="Only so many pairs, for a quick look.")] = None,
+    json: Json = None,
+) -> None:
+    """Measure methods on the pairs of an experiment, or on your own.
+
+    [bold]Examples[/bold]
+
+      idam evaluate unseen-shapes --data modelnet40 --limit 100
+
+      idam evaluate --pairs pairs.npz --method gnn-idam --model gnn-unseen-shapes --json out.json
+    """
+    from idam.evaluation.experiments import read_pairs, run, test_pairs
+    from idam.evaluation.methods import METHODS, build_method
+    from idam.io import write_json
+
+    if (experiment is None) == (pairs is None):
+        raise InputError("give either an experiment with --data or your own --pairs")
+    if pairs is not None:
+        test = read_pairs(pairs)
+    elif data is None:
+        raise InputError("an experiment needs --data, the folder of ModelNet40")
+    else:
+        test = test_pairs(str(experiment), data)
+    if limit is not None:
+        test = test[:limit]
+    names = method or list(METHODS)
+    built = [build_method(name, model) for name in names]
+    rows: list[Row] = []
+    with progress_bar(len(test) * len(names)) as advance:
+        for name, registers in zip(names, built, strict=True):
+            rows.append(run(name, registers, test, model, advance))
+            if json is not None:
+                write_json(json, record(rows, str(experiment or pairs)))
+    from rich.console import Console
+
+    Console().print(results_table(rows))
+
+
+def record(rows: list[Row], what: str) -> dict[str, Any]:
+    """What ``--json`` holds: the rows, and the only row's figures at the top as well."""
+    single = rows[0].to_dict() if len(rows) == 1 else {}
+    return {"pairs_from": what, **single, "rows": [row.to_dict() for row in rows]}
+
+
+def results_table(rows: list[Row]) -> Table:
+    """The rows as the paper sets them: rotation in degrees, translation in the clouds' unit."""
+    from rich.table import Table
+
+    table = Table("method", "RMSE(R)", "MAE(R)", "RMSE(t)", "MAE(t)", "recall", "ms a pair")
+    for row in rows:
+        m = row.metrics
+        table.add_row(
+            row.method,
+            f"{m.rmse_r:.3f}",
+            f"{m.mae_r:.3f}",
+            f"{m.rmse_t:.4f}",
+            f"{m.mae_t:.4f}",
+            f"{m.recall:.3f}",
+            f"{row.seconds_per_pair * 1000:.1f}",
+        )
+    return table
+
+
+def progress_bar(total: int) -> Any:
+    """A context manager that shows a bar on stderr and gives the function that advances it."""
+    from contextlib import contextmanager
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    @contextmanager
+    def bar() -> Any:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("registering", total=total)
+            yield lambda: progress.advance(task)
+
+    return bar()
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the page and the aligned cloud.")] = Path("out"),
+) -> None:
+    """Align two shipped scans of a CAD part, seen by a depth camera from 60 degrees apart."""
+    from idam.demo import run
+
+    result, files = run(output)
+    show(result)
+    for what, path in files.items():
+        print(f"{what:<12}{path}")
+
+
+if __name__ == "__main__":
+    main()

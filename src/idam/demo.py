@@ -1,0 +1,35 @@
+"""The shipped example: two views of a CAD part, registered and written out to look at."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from idam.errors import InputError
+from idam.io import read_point_cloud, write_point_cloud, write_transform
+from idam.registration import register
+from idam.report import write_report
+from idam.result import RegistrationResult
+
+__all__ = ["run"]
+
+
+def run(output: Path) -> tuple[RegistrationResult, dict[str, Path]]:
+    """Register the shipped scans, and write the page, the aligned cloud and the transform to a folder.
+
+    Raises:
+        InputError: the folder cannot be made or written.
+    """
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{output}: cannot make this folder ({error.strerror}); choose another --output") from None
+    folder = resources.files("idam") / "data" / "demo"
+    with resources.as_file(folder / "source.ply") as source, resources.as_file(folder / "target.ply") as target:
+        clouds = read_point_cloud(source), read_point_cloud(target)
+    result = register(*clouds)
+    files = {"page": output / "demo.html", "aligned": output / "aligned.ply", "transform": output / "transform.txt"}
+    write_report(files["page"], *clouds, result, source_name="source.ply", target_name="target.ply")
+    write_point_cloud(files["aligned"], clouds[0].transformed(result.transformation))
+    write_transform(files["transform"], result.transformation)
+    return result, files

@@ -1,0 +1,107 @@
+"""Candidate transforms from the network: many starting rotations, run as one batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from idam.geometry import compose, random_rotation
+from idam.network.model import IDAM, KeyPoints
+from idam.result import Matches
+
+__all__ = ["Hypothesis", "propose", "starting_rotations"]
+
+Points = NDArray[np.float64]
+
+PAIRS_AT_ONCE = 400_000
+"""Pairs of key points in one pass of the similarity convolution: bounds the memory to some hundred megabytes."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A candidate transform (4, 4) in working coordinates, the matches it came from, and how valid they seemed.
+
+    Attributes:
+        transformation: working source to working target.
+        matches: in working coordinates.
+        validity: mean validity of the matches that kept a weight.
+    """
+
+    transformation: Points
+    matches: Matches
+    validity: float
+
+
+def starting_rotations(count: int, seed: int) -> torch.Tensor:
+    """``count`` rotations (count, 3, 3), the identity and then the best spread of random ones for the seed.
+
+    Each next one is the candidate farthest from all chosen so far, which covers SO(3) evenly.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    pool = torch.cat([torch.eye(3)[None], random_rotation(64 * count, generator=generator)])
+    # tr(R_a^T R_b) falls with the angle between them: it is the similarity to keep small
+    closest = torch.full((len(pool),), -torch.inf)
+    chosen = [0]
+    for _ in range(count - 1):
+        closest = torch.maximum(closest, (pool * pool[chosen[-1]]).sum((-1, -2)))
+        chosen.append(int(closest.argmin()))
+    return pool[chosen]
+
+
+@torch.inference_mode()
+def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor) -> list[Hypothesis]:
+    """One hypothesis for each starting rotation (S, 3, 3) of the source, in that order.
+
+    Args:
+        network: in evaluation mode.
+        source: working points (N, 3).
+        target: working points (P, 3).
+        starts: rotations applied to the source before the network sees it.
+    """
+    device = next(network.parameters()).device
+    source_points = torch.as_tensor(source, dtype=torch.float32, device=device)[None]
+    target_points = torch.as_tensor(target, dtype=torch.float32, device=device)[None]
+    target_keys = network.eliminate(target_points, network.features(target_points))
+    pairs = len(source) * len(target) * network.config.keep**2
+    at_once = max(1, int(PAIRS_AT_ONCE / max(1.0, pairs)))
+    hypotheses: list[Hypothesis] = []
+    for some in starts.to(device).split(at_once):
+        turned = source_points @ some.transpose(-1, -2)
+        source_keys = network.eliminate(turned, network.features(turned))
+        hypotheses += _run(network, source_keys, _repeat(target_keys, len(some)), some)
+    return hypotheses
+
+
+def _repeat(keys: KeyPoints, count: int) -> KeyPoints:
+    return KeyPoints(
+        keys.points.expand(count, -1, -1),
+        keys.features.expand(count, -1, -1),
+        keys.index.expand(count, -1),
+        keys.significance.expand(count, -1),
+    )
+
+
+def _run(network: IDAM, source: KeyPoints, target: KeyPoints, starts: torch.Tensor) -> list[Hypothesis]:
+    output = network.match(source, target)
+    rotation, translation = compose(output.rotation, output.translation, starts, torch.zeros_like(output.translation))
+    last = output.iterations[-1]
+    keys = source.points @ starts
+    kept = last.weight > 0
+    validity = (last.validity * kept).sum(-1) / kept.sum(-1).clamp_min(1)
+    hypotheses = []
+    for n in range(len(starts)):
+        transformation = np.eye(4)
+        transformation[:3, :3] = _nearest_rotation(rotation[n].double().cpu().numpy())
+        transformation[:3, 3] = translation[n].double().cpu().numpy()
+        matches = Matches(*(x[n].double().cpu().numpy() for x in (keys, last.match, last.weight)))
+        hypotheses.append(Hypothesis(transformation, matches, float(validity[n])))
+    return hypotheses
+
+
+def _nearest_rotation(matrix: Points) -> Points:
+    """The rotation nearest to one (3, 3) composed in single precision."""
+    u, _, vh = np.linalg.svd(matrix)
+    return np.asarray(u @ vh)

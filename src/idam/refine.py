@@ -1,0 +1,91 @@
+"""Fine alignment on dense clouds through small_gicp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from idam.errors import InputError
+
+__all__ = ["METHODS", "Refinable", "refine"]
+
+Points = NDArray[np.float64]
+
+METHODS = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
+"""Fine alignments by name: generalised ICP, point to plane, point to point."""
+
+NEIGHBOURS = 15
+"""Points that each normal and covariance is estimated from."""
+
+
+@dataclass(frozen=True)
+class Refinable:
+    """A cloud with what fine alignment needs of it: normals, covariances and a search tree."""
+
+    cloud: Any
+    tree: Any
+
+    @classmethod
+    def build(cls, points: Points) -> Refinable:
+        """From points (N, 3) in working coordinates."""
+        import small_gicp
+
+        cloud = small_gicp.PointCloud(points)
+        tree = small_gicp.KdTree(cloud)
+        small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=min(NEIGHBOURS, len(points)))
+        return cls(cloud, tree)
+
+    @property
+    def points(self) -> Points:
+        """(N, 3)."""
+        return np.asarray(self.cloud.points()[:, :3])
+
+    @property
+    def normals(self) -> Points:
+        """(N, 3), of either sign."""
+        return np.asarray(self.cloud.normals()[:, :3])
+
+
+def refine(
+    source: Refinable, target: Refinable, start: Points, distance: float, method: str = "gicp", iterations: int = 30
+) -> tuple[Points, NDArray[np.float64]]:
+    """Improve a transform (4, 4) that is nearly right.
+
+    Args:
+        source: in working coordinates, about the unit sphere: the tolerances count on it.
+        target: likewise.
+        start: where to begin.
+        distance: points further apart do not pull on each other.
+        method: one of :data:`METHODS`.
+        iterations: at most.
+
+    Returns:
+        The transform (4, 4), and the information matrix (6, 6), rotation before translation. Where nothing lies within
+        ``distance`` or the solution is not finite, the start and zeros.
+
+    Raises:
+        InputError: the method is unknown.
+    """
+    import small_gicp
+
+    if method not in METHODS:
+        raise InputError(f"unknown refinement {method!r}: choose {', '.join(METHODS)} or none")
+    result = small_gicp.align(
+        target.cloud,
+        source.cloud,
+        target.tree,
+        start,
+        registration_type=METHODS[method],
+        max_correspondence_distance=distance,
+        num_threads=1,
+        max_iterations=iterations,
+        rotation_epsilon=1e-5,
+        translation_epsilon=1e-6,
+    )
+    transformation = np.asarray(result.T_target_source)
+    if result.num_inliers < 10 or not np.isfinite(transformation).all():
+        return start, np.zeros((6, 6))
+    return transformation, np.asarray(result.H)

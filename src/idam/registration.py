@@ -1,0 +1,217 @@
+"""``register``: from two clouds of any size to one transform."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from idam.confidence import Evidence, confidence
+from idam.errors import InputError
+from idam.hypotheses import propose, starting_rotations
+from idam.io import as_point_cloud
+from idam.network.model import IDAM
+from idam.network.pretrained import load_model
+from idam.preprocess import MIN_POINTS, Frame, check_points, choose_voxel_size, common_frame, downsample
+from idam.ranking import Answer, Surfaces, distinct, improve
+from idam.refine import METHODS, Refinable
+from idam.refine import refine as refine_once
+from idam.result import Matches, RegistrationResult
+from idam.scoring import inliers
+
+__all__ = ["register"]
+
+Points = NDArray[np.float64]
+
+NETWORK_POINTS = 1024
+"""Points of the larger cloud that the network sees: what it was trained on."""
+DENSE_POINTS = 4096
+"""Points of the larger cloud that hypotheses are refined and scored on."""
+FINE_POINTS = 30_000
+"""Points of the larger cloud that the last refinement uses."""
+STARTS = 24
+"""Rotations of the source that the network starts from."""
+CONTENDERS = 4
+"""Answers that stay in the race on the dense clouds."""
+
+
+def register(
+    source: Any,
+    target: Any,
+    *,
+    model: str = "default",
+    init: ArrayLike | None = None,
+    voxel_size: float | None = None,
+    max_correspondence_distance: float | None = None,
+    refine: str | None = "gicp",
+    seed: int = 0,
+    device: str | None = None,
+) -> RegistrationResult:
+    """Find the rigid transform that lays the source on the target.
+
+    Args:
+        source: a path, an (N, 3) array or tensor, or an Open3D or trimesh cloud; in any unit, of any size.
+        target: likewise, in the same unit.
+        model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them.
+        init: (4, 4), a guess of the transform to try beside the network's own starts.
+        voxel_size: of the clouds the network sees, in the input's units; None takes it from the data.
+        max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for the spacing
+            of the points the clouds were scored on.
+        refine: fine alignment on the dense clouds, ``gicp``, ``plane`` or ``point``; None or ``none`` for the
+            network's answer alone.
+        seed: of the starting rotations.
+        device: where the network runs; None for the CPU.
+
+    Returns:
+        The transform in float64, how well it fits, and how sure it is.
+
+    Raises:
+        InputError: a ValueError, in one line: a file that cannot be read, a wrong shape, too few points, NaN or
+            infinity, points all equal or on one line, or an unknown model or option.
+    """
+    started = time.perf_counter()
+    check_options(voxel_size, max_correspondence_distance, refine)
+    source_points, target_points = (as_points(data, name) for data, name in ((source, "source"), (target, "target")))
+    network = cached_model(os.fspath(model), device)
+    frame = common_frame(source_points, target_points)
+    small, dense, fine = pyramid(
+        frame.source(source_points), frame.target(target_points), voxel_size and voxel_size / frame.scale
+    )
+    guess = np.eye(4) if init is None else frame.enter(as_rigid(init))
+    starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
+    hypotheses = propose(network, small.source, small.target, starts)
+    method = refine or "none"
+    answers = [Answer(h.transformation, h) for h in hypotheses]
+    answers = distinct(improve(answers, small.surfaces(), 4.0, method))[:CONTENDERS]
+    answers = distinct(improve(answers, dense.surfaces(), 2.0, method))
+    transformation, information = finish(answers[0], fine, method)
+    full = frame.undo(transformation)
+    distance = max_correspondence_distance or dense.spacing * frame.scale
+    moved = source_points @ full[:3, :3].T + full[:3, 3]
+    correspondence_set, rmse = inliers(moved, target_points, distance)
+    return RegistrationResult(
+        transformation=full,
+        fitness=len(correspondence_set) / len(source_points),
+        inlier_rmse=rmse,
+        correspondence_set=correspondence_set,
+        confidence=confidence(gather_evidence(answers, small.spacing)),
+        max_correspondence_distance=distance,
+        information=information,
+        matches=in_input_units(answers[0].hypothesis.matches, frame),
+        model=os.fspath(model),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def check_options(voxel_size: float | None, distance: float | None, refine: str | None) -> None:
+    """Raise InputError for options out of range."""
+    for name, value in (("voxel_size", voxel_size), ("max_correspondence_distance", distance)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} must be a positive number, not {value}; leave it out to take it from the data")
+    if refine not in (None, "none", *METHODS):
+        raise InputError(f"unknown refinement {refine!r}: choose {', '.join(METHODS)} or none")
+
+
+def as_points(data: Any, name: str) -> Points:
+    """Points (N, 3) of anything that :func:`register` takes, checked; raise InputError where they cannot be used."""
+    points = as_point_cloud(data).points
+    check_points(points, os.fspath(data) if isinstance(data, (str, os.PathLike)) else name)
+    return points
+
+
+def as_rigid(init: ArrayLike) -> Points:
+    """A given transform as (4, 4) float64; raise InputError where it is not rigid."""
+    try:
+        matrix = np.asarray(init, np.float64)
+    except (TypeError, ValueError):
+        raise InputError("init must be a 4x4 matrix of numbers") from None
+    if matrix.shape != (4, 4):
+        raise InputError(f"init must be a 4x4 matrix, not of shape {matrix.shape}")
+    rotation = matrix[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    if not (np.isfinite(matrix).all() and rigid and np.allclose(matrix[3], [0, 0, 0, 1])):
+        raise InputError("init is not a rigid transform: it needs a rotation, a translation and a last row 0 0 0 1")
+    return matrix
+
+
+@lru_cache(4)
+def cached_model(name: str, device: str | None) -> IDAM:
+    """A model, read from its file the first time only."""
+    return load_model(name, device)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Both clouds at one resolution, in working coordinates, and the spacing of their points."""
+
+    source: Points
+    target: Points
+    spacing: float
+
+    def surfaces(self) -> Surfaces:
+        """The clouds with normals, ready for refinement."""
+        return Surfaces(Refinable.build(self.source), Refinable.build(self.target), self.spacing)
+
+
+def pyramid(source: Points, target: Points, voxel_size: float | None) -> tuple[Level, Level, Level]:
+    """The clouds at three resolutions: for the network, for ranking hypotheses, and for the last refinement."""
+    fine = level(source, target, FINE_POINTS)
+    dense = level(fine.source, fine.target, DENSE_POINTS)
+    if voxel_size is None:
+        return level(dense.source, dense.target, NETWORK_POINTS), dense, fine
+    small = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
+    if min(map(len, small)) < MIN_POINTS:
+        raise InputError(f"a voxel size of {voxel_size:.3g} leaves {min(map(len, small))} points; give a smaller one")
+    return Level(*small, voxel_size), dense, fine
+
+
+def level(source: Points, target: Points, count: int) -> Level:
+    """Both clouds on one voxel grid that leaves about ``count`` points of the larger."""
+    voxel_size = choose_voxel_size([source, target], count)
+    if voxel_size > 0:
+        source, target = downsample(source, voxel_size), downsample(target, voxel_size)
+    return Level(source, target, max(spacing(source), spacing(target)))
+
+
+def spacing(points: Points) -> float:
+    """The median distance of a point to its nearest neighbour that is not at the same place."""
+    distance = cKDTree(points).query(points, k=2)[0][:, 1]
+    return float(np.median(distance[distance > 0]))
+
+
+def finish(answer: Answer, fine: Level, method: str) -> tuple[Points, NDArray[np.float64]]:
+    """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6)."""
+    if method == "none":
+        return answer.transformation, np.zeros((6, 6))
+    surfaces = fine.surfaces()
+    return refine_once(surfaces.source, surfaces.target, answer.transformation, 2.0 * fine.spacing, method)
+
+
+def gather_evidence(answers: list[Answer], spacing: float) -> Evidence:
+    """What speaks for the best answer."""
+    best = answers[0]
+    matches = best.hypothesis.matches
+    moved = matches.source @ best.transformation[:3, :3].T + best.transformation[:3, 3]
+    together = np.linalg.norm(moved - matches.target, axis=1) < 2.0 * spacing
+    return Evidence(
+        overlap=best.overlap,
+        margin=best.overlap - (answers[1].overlap if len(answers) > 1 else 0.0),
+        support=float(matches.weight[together].sum()),
+        votes=best.votes / STARTS,
+    )
+
+
+def in_input_units(matches: Matches, frame: Frame) -> Matches:
+    """Working matches in the input's coordinates."""
+    return Matches(
+        matches.source * frame.scale + frame.source_centre,
+        matches.target * frame.scale + frame.target_centre,
+        matches.weight,
+    )
