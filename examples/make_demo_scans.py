@@ -15,15 +15,18 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 from scipy.spatial import KDTree
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[np.floating[Any]]
 Triple = tuple[float, float, float]
 
+BOLTS = ((-0.143, -0.073), (-0.143, 0.073), (0.143, -0.073), (0.03, 0.073))
+MOTOR_PROFILE = ((0.0, 0.02), (0.09, 0.02), (0.09, 0.165), (0.045, 0.165), (0.0, 0.115))
 DEMO_FOLDER = Path(__file__).resolve().parents[1] / "src" / "idam" / "data" / "demo"
 
 
@@ -37,31 +40,31 @@ class DepthCamera:
 
     width: int = 320
     height: int = 240
-    focal_length: float = 410.0
+    focal_length: float = 335.0
     baseline: float = 0.075
     depth_unit: float = 0.001
     lateral_noise: float = 0.4
     grazing_cosine: float = 0.3
 
     def rays(self) -> Array:
-        """The ray of every pixel, (height, width, 3), scaled to z = 1."""
+        """Return the ray of every pixel, (height, width, 3), scaled to z = 1."""
         rows, columns = np.mgrid[: self.height, : self.width].astype(np.float64)
         x = (columns - (self.width - 1) / 2) / self.focal_length
         y = (rows - (self.height - 1) / 2) / self.focal_length
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def project(self, points: Array) -> Array:
-        """Points (..., 3) in the camera's frame to pixel coordinates (..., 2): column, row."""
+        """Take points (..., 3) in the camera's frame to pixel coordinates (..., 2): column, row."""
         centre = np.array([self.width - 1, self.height - 1]) / 2
         return np.asarray(points[..., :2] / points[..., 2:] * self.focal_length + centre)
 
     def axial_noise(self, depth: Array) -> Array:
-        """The standard deviation of a depth measurement."""
+        """Return the standard deviation of a depth measurement."""
         return 0.0012 + 0.0019 * (depth - 0.4) ** 2
 
 
 def machine_part() -> Array:
-    """A bearing block on a base plate with a gear motor beside it: triangles (F, 3, 3) in metres, z up.
+    """Build a bearing block with a gear motor beside it on a base plate: triangles (F, 3, 3) in metres, z up.
 
     The solids overlap freely: from outside, the first hit sees their union.
     """
@@ -77,48 +80,44 @@ def machine_part() -> Array:
         _hull([(x, y, z) for y in (-0.009, 0.009) for x, z in ((0.0, 0.02), (0.095, 0.02), (0.0, 0.125))]),
         _hull([(x, y, z) for x in (-0.1, -0.084) for y, z in ((0.03, 0.02), (0.095, 0.02), (0.03, 0.085))]),
         # the motor: housing with one slanted edge, shaft end, cooling fins
-        _hull(
-            [
-                (x, y, z)
-                for x in (0.075, 0.165)
-                for y, z in ((0.0, 0.02), (0.09, 0.02), (0.09, 0.165), (0.045, 0.165), (0.0, 0.115))
-            ]
-        ),
+        _hull([(x, y, z) for x in (0.075, 0.165) for y, z in MOTOR_PROFILE]),
         _rod((0.12, 0.0, 0.068), axis="y", radius=0.03, length=0.06),
         _rod((0.12, -0.04, 0.068), axis="y", radius=0.013, length=0.07),
         *(_box((x, x + 0.008), (0.04, 0.088), (0.16, 0.19)) for x in (0.08, 0.103, 0.126, 0.149)),
-        # bolted down in three corners, the fourth boss is empty
-        *(_tube((x, y, 0.026), axis="z", inner=0.010, outer=0.022, length=0.02) for x, y in _CORNERS),
-        *(_rod((x, y, 0.042), axis="z", radius=0.016, length=0.02, sides=6) for x, y in _CORNERS[:3]),
+        # bolted down at three bosses, the fourth is empty
+        *(_tube((x, y, 0.026), axis="z", inner=0.010, outer=0.022, length=0.02) for x, y in BOLTS),
+        *(_rod((x, y, 0.042), axis="z", radius=0.016, length=0.02, sides=6) for x, y in BOLTS[:3]),
     ]
-    return np.concatenate([np.asarray(solid.triangles, dtype=np.float64) for solid in solids])
+    return np.concatenate(solids)
 
 
-_CORNERS = ((-0.143, -0.073), (-0.143, 0.073), (0.143, -0.073), (0.03, 0.073))
+def _box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Array:
+    """Make an axis-aligned box from its three intervals."""
+    return _triangles(trimesh.creation.box(bounds=np.array([x, y, z]).T))
 
 
-def _box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> trimesh.Trimesh:
-    """An axis-aligned box from its three intervals."""
-    return trimesh.creation.box(bounds=np.array([x, y, z]).T)
+def _rod(centre: Triple, axis: str, radius: float, length: float, sides: int = 48) -> Array:
+    """Make a cylinder, or with few sides a prism such as a bolt's head."""
+    return _triangles(trimesh.creation.cylinder(radius, length, sections=sides, transform=_pose(centre, axis)))
 
 
-def _rod(centre: Triple, axis: str, radius: float, length: float, sides: int = 48) -> trimesh.Trimesh:
-    """A cylinder, or with few sides a prism such as a bolt's head."""
-    return trimesh.creation.cylinder(radius, length, sections=sides, transform=_pose(centre, axis))
+def _tube(centre: Triple, axis: str, inner: float, outer: float, length: float) -> Array:
+    """Make a cylinder with a bore."""
+    return _triangles(trimesh.creation.annulus(inner, outer, length, sections=48, transform=_pose(centre, axis)))
 
 
-def _tube(centre: Triple, axis: str, inner: float, outer: float, length: float) -> trimesh.Trimesh:
-    """A cylinder with a bore."""
-    return trimesh.creation.annulus(inner, outer, length, sections=48, transform=_pose(centre, axis))
+def _hull(corners: list[Triple]) -> Array:
+    """Make the convex solid over its corners."""
+    return _triangles(trimesh.convex.convex_hull(np.array(corners)))
 
 
-def _hull(corners: list[Triple]) -> trimesh.Trimesh:
-    """The convex solid over its corners."""
-    return trimesh.convex.convex_hull(np.array(corners))
+def _triangles(mesh: trimesh.Trimesh) -> Array:
+    """Take the corners of a mesh's faces, (F, 3, 3)."""
+    return np.asarray(mesh.triangles, dtype=np.float64)
 
 
 def _pose(centre: Triple, axis: str) -> Array:
-    """The transform that takes a primitive from the origin to ``centre`` and its z axis to ``axis``."""
+    """Return the transform that takes a primitive from the origin to ``centre`` and its z axis to ``axis``."""
     pose = np.eye(4)
     if axis == "y":
         pose[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
@@ -127,7 +126,7 @@ def _pose(centre: Triple, axis: str) -> Array:
 
 
 def camera_pose(azimuth: float, elevation: float, roll: float, distance: float) -> Array:
-    """T_world_camera of a camera that looks at the part's middle from the given side; angles in degrees."""
+    """Return T_world_camera of a camera that looks at the part's middle from the given side; angles in degrees."""
     a, e, r = np.radians([azimuth, elevation, roll])
     forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
@@ -145,7 +144,7 @@ def transform(T: Array, points: Array) -> Array:
 
 
 def render(camera: DepthCamera, triangles: Array, rays: Array) -> tuple[Array, Array]:
-    """Depth (height, width) of each ray's first hit, infinite without one, and the cosine of its angle of incidence.
+    """Find each ray's first hit: its depth (height, width), infinite without one, and the cosine of its incidence.
 
     The camera is at the origin, so ray d passes inside the triangle a, b, c where d·(a×b), d·(b×c) and d·(c×a) have
     one sign, and meets its plane at the depth a·n / d·n. Each triangle only meets the rays of its own bounding box.
@@ -173,7 +172,7 @@ def render(camera: DepthCamera, triangles: Array, rays: Array) -> tuple[Array, A
 
 
 def lit_by_projector(camera: DepthCamera, triangles: Array, points: Array) -> npt.NDArray[np.bool_]:
-    """Which points (N, 3) the projector, one baseline to the camera's right, reaches."""
+    """Say which points (N, 3) are reached by the projector, which is one baseline to the camera's right."""
     offset = np.array([camera.baseline, 0.0, 0.0])
     shadow_map, _ = render(camera, triangles - offset, camera.rays())
     column, row = np.rint(camera.project(points - offset)).astype(int).T
@@ -184,7 +183,7 @@ def lit_by_projector(camera: DepthCamera, triangles: Array, points: Array) -> np
 
 
 def scan(camera: DepthCamera, part: Array, T_world_camera: Array, rng: np.random.Generator) -> Array:
-    """One noisy view of the part's triangles as points (N, 3) in the camera's frame."""
+    """Take one noisy view of the part's triangles: points (N, 3) in the camera's frame."""
     triangles = transform(np.linalg.inv(T_world_camera), part)
     rays = camera.rays()
     blurred = rays.copy()
@@ -192,19 +191,20 @@ def scan(camera: DepthCamera, part: Array, T_world_camera: Array, rng: np.random
     depth, cosine = render(camera, triangles, blurred)
     returned = np.isfinite(depth) & (cosine > camera.grazing_cosine * rng.random(depth.shape))
     depth, blurred, rays = depth[returned], blurred[returned], rays[returned]
-    depth, rays = (kept[lit_by_projector(camera, triangles, blurred * depth[:, None])] for kept in (depth, rays))
+    lit = lit_by_projector(camera, triangles, blurred * depth[:, None])
+    depth, rays = depth[lit], rays[lit]
     measured = depth + camera.axial_noise(depth) * rng.normal(size=depth.shape)
     # everything after the rounding is exact arithmetic, so the files do not hang on a processor's last bit
     return np.asarray(np.rint(measured / camera.depth_unit)[:, None] * camera.depth_unit * rays)
 
 
 def spacing(points: Array) -> float:
-    """The median distance of a point to its nearest neighbour."""
+    """Measure the median distance of a point to its nearest neighbour."""
     return float(np.median(KDTree(points).query(points, k=2)[0][:, 1]))
 
 
 def overlap(source: Array, target: Array, T_target_source: Array) -> float:
-    """The share of source points with a target point within 1.5 times the target's spacing, under the transform."""
+    """Measure the share of source points that land within 1.5 spacings of a target point under the transform."""
     distances, _ = KDTree(target).query(transform(T_target_source, source))
     return float(np.mean(distances < 1.5 * spacing(target)))
 
@@ -224,8 +224,8 @@ def main() -> None:
     out_dir.mkdir(parents=True, exist_ok=True)
 
     camera, part, rng = DepthCamera(), machine_part(), np.random.default_rng(20)
-    T_world_source = camera_pose(azimuth=-100.0, elevation=28.0, roll=0.0, distance=0.80)
-    T_world_target = camera_pose(azimuth=-40.0, elevation=40.0, roll=12.0, distance=0.85)
+    T_world_source = camera_pose(azimuth=-79.0, elevation=26.0, roll=-4.0, distance=0.80)
+    T_world_target = camera_pose(azimuth=-16.0, elevation=38.0, roll=8.0, distance=0.85)
     source = scan(camera, part, T_world_source, rng)
     target = scan(camera, part, T_world_target, rng)
     T_target_source = np.linalg.inv(T_world_target) @ T_world_source

@@ -270,8 +270,9 @@ Object.assign(document.documentElement.dataset, { painter: Painter.name, ink: in
 </script>"""
 
 
-@pytest.mark.parametrize("match_count", [24, 0])
-@pytest.mark.parametrize("painter", ["WebGLPainter", "SoftwarePainter"])
+@pytest.mark.parametrize(
+    ("painter", "match_count"), [("WebGLPainter", 24), ("WebGLPainter", 0), ("SoftwarePainter", 24)]
+)
 def test_browser_draws_both_clouds_in_both_views(tmp_path: Path, painter: str, match_count: int) -> None:
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:

@@ -80,7 +80,9 @@ def register(
     html: Annotated[Path | None, typer.Option(help="Write a page to look at the result, opens offline.")] = None,
     model: Annotated[str, typer.Option(help="Name or file of the weights; see 'idam models'.")] = "default",
     init: Annotated[Path | None, typer.Option(help="File of a 4x4 to start from.")] = None,
-    voxel_size: Annotated[float | None, typer.Option(help="Resolution for the network; from the data if left out.")] = None,
+    voxel_size: Annotated[
+        float | None, typer.Option(help="Resolution for the network; from the data if left out.")
+    ] = None,
     max_correspondence_distance: Annotated[
         float | None, typer.Option(help="Distance for fitness and RMSE; from the data if left out.")
     ] = None,
@@ -311,7 +313,9 @@ def progress_bar(total: int) -> Any:
 
 @app.command()
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the page and the aligned cloud.")] = Path("out"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the page and the aligned cloud.")] = Path(
+        "out"
+    ),
 ) -> None:
     """Align two shipped scans of a CAD part, seen by a depth camera from 60 degrees apart."""
     from idam.demo import run

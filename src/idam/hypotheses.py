@@ -68,7 +68,7 @@ def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor)
     pairs = len(source) * len(target) * network.config.keep**2
     at_once = max(1, int(PAIRS_AT_ONCE / max(1.0, pairs)))
     hypotheses: list[Hypothesis] = []
-    for some in starts.to(device).split(at_once):
+    for some in torch.split(starts.to(device), at_once):
         turned = source_points @ some.transpose(-1, -2)
         source_keys = network.eliminate(turned, network.features(turned))
         hypotheses += _run(network, source_keys, _repeat(target_keys, len(some)), some)

@@ -79,6 +79,4 @@ def distinct(answers: list[Answer]) -> list[Answer]:
 def alike(a: Points, b: Points) -> bool:
     """Whether two working transforms (4, 4) turn and shift the source nearly the same way."""
     cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
-    return bool(
-        cosine > np.cos(np.radians(SAME_ANGLE)) and np.linalg.norm(a[:3, 3] - b[:3, 3]) < SAME_SHIFT
-    )
+    return bool(cosine > np.cos(np.radians(SAME_ANGLE)) and np.linalg.norm(a[:3, 3] - b[:3, 3]) < SAME_SHIFT)

@@ -57,7 +57,8 @@ class RegistrationResult:
 
     def apply(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points (..., 3) of the source's frame, in the target's frame."""
-        return np.asarray(points, np.float64) @ self.transformation[:3, :3].T + self.transformation[:3, 3]
+        moved: NDArray[np.float64] = np.asarray(points, np.float64) @ self.transformation[:3, :3].T
+        return moved + self.transformation[:3, 3]
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result as JSON (every field of :meth:`to_dict`), atomically; ``.txt`` writes the 4x4 alone.

@@ -6,11 +6,8 @@ import json
 import math
 import os
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +20,8 @@ from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform, gather_points
 from idam.memory import keep_freed_memory
-from idam.network.model import IDAM, Config
-from idam.network.pretrained import save_model
+from idam.network.model import IDAM, Config, KeyPoints
+from idam.network.pretrained import load_model, save_model
 from idam.network.sampling import balanced_sample
 from idam.network.supervision import Loss, mutual_supervision
 
@@ -48,7 +45,10 @@ class Recipe:
         learning_rate: Adam's, at its highest.
         weight_decay: Adam's.
         radius: r of the loss and of balanced sampling.
-        keep: share of points that balanced sampling draws, as hard elimination would keep.
+        keep: share of points that balanced sampling draws.
+        eliminate_targets: match the sampled sources against the target points that hard elimination keeps, as after
+            training, rather than against the sources' nearest target points.
+        start: name or file of a model whose weights to start from; None for random ones.
         seed: of the weights, pairs and samples.
     """
 
@@ -61,6 +61,8 @@ class Recipe:
     weight_decay: float = 1e-3
     radius: float = 0.05
     keep: float = 1 / 6
+    eliminate_targets: bool = False
+    start: str | None = None
     seed: int = 0
 
     @property
@@ -93,25 +95,37 @@ class Batch(NamedTuple):
 class SupervisedStep(nn.Module):
     """The network and its loss as one module, so that distributed wrappers see one forward pass."""
 
-    def __init__(self, model: IDAM, radius: float, precision: str) -> None:
+    def __init__(self, model: IDAM, recipe: Recipe, precision: str) -> None:
         super().__init__()
         self.model = model
-        self.radius = radius
+        self.recipe = recipe
         self.precision = precision
 
     def forward(self, batch: Batch) -> Loss:
         """The loss of the pairs on their sampled points."""
-        source, target = gather_points(batch.source, batch.source_index), gather_points(batch.target, batch.target_index)
         # Fabric's own autocast would round the coordinates on the way in, and the labels need them exact as well
-        with torch.autocast(source.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+        with torch.autocast(batch.source.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             source_features, target_features = self.model.encode(batch.source, batch.target)
-            source_features = gather_points(source_features, batch.source_index)
-            target_features = gather_points(target_features, batch.target_index)
-            iterations = self.model.iterate(source, target, source_features, target_features)
-            significance = self.model.significance(source_features), self.model.significance(target_features)
+            source = self._sample(batch.source, source_features, batch.source_index)
+            if self.recipe.eliminate_targets:
+                target = self.model.eliminate(batch.target, target_features)
+            else:
+                target = self._sample(batch.target, target_features, batch.target_index)
+            iterations = self.model.iterate(source.points, target.points, source.features, target.features)
         return mutual_supervision(
-            iterations, source, target, batch.rotation, batch.translation, *significance, self.radius
+            iterations,
+            source.points,
+            target.points,
+            batch.rotation,
+            batch.translation,
+            source.significance.gather(1, source.index),
+            target.significance.gather(1, target.index),
+            self.recipe.radius,
         )
+
+    def _sample(self, points: Tensor, features: Tensor, index: Tensor) -> KeyPoints:
+        significance = self.model.significance(features)
+        return KeyPoints(gather_points(points, index), gather_points(features, index), index, significance)
 
 
 @torch.inference_mode()
@@ -204,9 +218,11 @@ def train(
     )
     fabric.launch()
     torch.manual_seed(recipe.seed)
-    shapes, validation = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.noise)
+    shapes, validation = split_validation(
+        experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.noise
+    )
     total = max(1, round(recipe.epochs * max(1, len(shapes) // recipe.batch_size)))
-    module = SupervisedStep(IDAM(recipe.config), recipe.radius, precision)
+    module = SupervisedStep(initial_model(recipe), recipe, precision)
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     progress = restore(output / "last.ckpt", module, optimizer, recipe) if resume else Progress()
     step_module, step_optimizer = fabric.setup(module, optimizer)
@@ -228,7 +244,9 @@ def train(
                     log.validation(step, scores)
                     if scores.mae_r < progress.best:
                         progress.best = scores.mae_r
-                        save_model(output / "best.safetensors", module.model, history(recipe, progress, scores, command))
+                        save_model(
+                            output / "best.safetensors", module.model, history(recipe, progress, scores, command)
+                        )
                     save_checkpoint(output / "last.ckpt", module, optimizer, progress, recipe)
                 fabric.barrier()
     return output / "best.safetensors"
@@ -242,6 +260,19 @@ def check(recipe: Recipe) -> None:
         raise InputError(f"unknown schedule {recipe.schedule!r}: choose step or one-cycle")
     if recipe.epochs <= 0 or recipe.batch_size < 2 or recipe.learning_rate <= 0:
         raise InputError("epochs and the learning rate must be positive, and the batch at least 2 pairs")
+
+
+def initial_model(recipe: Recipe) -> IDAM:
+    """The network to train, with random weights or those to start from; raise InputError where those do not fit."""
+    model = IDAM(recipe.config)
+    if recipe.start is not None:
+        try:
+            model.load_state_dict(load_model(recipe.start).state_dict())
+        except RuntimeError:
+            raise InputError(
+                f"{recipe.start}: has another architecture; start from a model with the same options"
+            ) from None
+    return model
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -275,7 +306,11 @@ def commit() -> str:
     """The source's commit, or an empty string outside a checkout."""
     try:
         result = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+            ["git", "rev-parse", "--short", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=False,
         )
     except OSError:
         return ""
@@ -313,12 +348,17 @@ class Log:
     """A progress bar with the parts of the loss, and the same figures in TensorBoard."""
 
     def __init__(self, folder: Path, total: int, done: int, *, enabled: bool) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bar, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
         from torch.utils.tensorboard import SummaryWriter
 
         self.enabled = enabled
         self.bar = Bar(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), disable=not enabled
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            disable=not enabled,
         )
         self.task = self.bar.add_task("starting", total=total, completed=done)
         self.writer = SummaryWriter(str(folder)) if enabled else None

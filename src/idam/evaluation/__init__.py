@@ -1,0 +1,1 @@
+"""Measuring methods on pairs: metrics, the methods, and the experiments."""

@@ -85,7 +85,9 @@ def read_pairs(path: str | Path) -> Pairs:
     for name, array, shape in zip(("source", "target", "R", "t"), arrays, expected, strict=True):
         fits = len(array.shape) == len(shape) and all(b in (-1, a) for a, b in zip(array.shape, shape, strict=True))
         if not fits or count < 1:
-            raise InputError(f"{path}: {name} has shape {array.shape}; needed are (n, P, 3), (n, Q, 3), (n, 3, 3), (n, 3)")
+            raise InputError(
+                f"{path}: {name} has shape {array.shape}; needed are (n, P, 3), (n, Q, 3), (n, 3, 3), (n, 3)"
+            )
         if not np.isfinite(array).all():
             raise InputError(f"{path}: {name} holds NaN or infinite numbers")
     return Pairs(*(torch.from_numpy(array) for array in (source, target, rotation, translation)))

@@ -1,19 +1,29 @@
-"""LAS and LAZ, the formats of airborne and terrestrial laser scans, through the optional package laspy."""
+"""LAS and LAZ, the formats of airborne and terrestrial laser scans, through the optional package laspy.
+
+Neither laspy nor lazrs, which decompresses LAZ for it, doubts the counts and lengths in a file: a wrong one makes them
+loop, or allocate until the process is aborted. So all that they would trust is checked here first.
+"""
 
 from __future__ import annotations
 
 import io
 import struct
 import warnings
+from typing import Any
 
 import numpy as np
 
 from idam.errors import InputError, MissingDependencyError
 from idam.io.cloud import PointCloud
 from idam.io.columns import Numbers, check_size, cloud_from_columns
-from idam.io.files import check_unpacked_size
+from idam.io.files import check_unpacked_size, one_line
 
 __all__ = ["decode"]
+
+_COLORS = ("red", "green", "blue")
+
+# Layers of bytes that an item of a point (by its type) is split into in LAZ 1.4; other items have one for each byte.
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 
 
 def decode(data: bytes) -> PointCloud:
@@ -30,15 +40,11 @@ def decode(data: bytes) -> PointCloud:
     if _check_header(data) and not laspy.LazBackend.Lazrs.is_available():
         raise _missing()
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # one thread: it does not trust the table of chunks at the end of the file
-        reader = laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
-        points = reader.read_points(-1)
+    points = _read_points(data)
     coordinates: dict[str, Numbers] = {axis: np.asarray(points[axis]) for axis in "xyz"}
     colors: dict[str, Numbers] = {}
     if "red" in points.point_format.dimension_names:
-        colors = {name: np.asarray(points[name]) for name in ("red", "green", "blue")}
+        colors = {name: np.asarray(points[name]) for name in _COLORS}
     filled_in = any(values.any() for values in colors.values())
     return cloud_from_columns(coordinates | colors if filled_in else coordinates)
 
@@ -47,8 +53,26 @@ def _missing() -> MissingDependencyError:
     return MissingDependencyError("reading .las and .laz files needs laspy: pip install 'idam[las]'")
 
 
+def _read_points(data: bytes) -> Any:
+    import laspy
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            reader = laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
+            if reader.header.are_points_compressed:
+                _check_chunks(
+                    data, reader.header.offset_to_point_data, reader.header.vlrs.get("LasZipVlr")[0].record_data
+                )
+            return reader.read_points(-1)
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # of lazrs, which is written in Rust; it is no Exception
+            raise
+        raise InputError(f"damaged ({one_line(error)}): copy or export it again") from error
+
+
 def _check_header(data: bytes) -> bool:
-    """Refuse counts that the file cannot hold, on which laspy would loop or allocate; tell whether it is compressed."""
+    """Refuse counts that the file cannot hold; tell whether its points are compressed."""
     if not data.startswith(b"LASF"):
         raise InputError("not a LAS or LAZ file: check what it is")
     check_size(227, len(data), "a LAS header")
@@ -64,3 +88,26 @@ def _check_header(data: bytes) -> bool:
     else:
         check_size(points * row, len(data) - offset, f"{points:,} points")
     return compressed
+
+
+def _check_chunks(data: bytes, offset: int, description: bytes) -> None:
+    """Refuse a number of compressed chunks, or a length of one, that the file cannot hold."""
+    check_size(offset + 8, len(data), "compressed points")
+    (table,) = struct.unpack_from("<q", data, offset)
+    if table == -1:  # not known when the points were written: it follows them
+        (table,) = struct.unpack_from("<q", data, len(data) - 8)
+    if not offset <= table <= len(data) - 8:
+        raise InputError("cut short: its table of compressed chunks is missing: copy or export it again")
+    _, chunks = struct.unpack_from("<II", data, table)
+    check_size(chunks, len(data), f"{chunks:,} compressed chunks")
+
+    compressor, items = struct.unpack_from("<H30xH", description)
+    if compressor == 3:  # in layers, whose lengths stand after the first point of a chunk and the number of its points
+        kinds = np.frombuffer(description, "<u2", 3 * items, 34).reshape(items, 3).tolist()
+        first = sum(size for _, size, _ in kinds)
+        layers = sum(_LAYERS.get(kind, size) for kind, size, _ in kinds)
+        at = offset + 8
+        while at < table:
+            lengths = np.frombuffer(data, "<u4", layers, at + first + 4)
+            at += first + 4 + lengths.nbytes + int(lengths.sum(dtype=np.int64))
+            check_size(at, len(data), "a compressed chunk")

@@ -46,27 +46,32 @@ def decode(data: bytes) -> PointCloud:
 
 
 def encode(cloud: PointCloud, coordinates: str) -> bytes:
-    """Encode a binary PCD file with coordinates of type ``f4`` or ``f8``."""
-    names, types, columns = ["x", "y", "z"], [coordinates] * 3, [*cloud.points.T]
+    """Encode a PCD file: binary with coordinates of type ``f4``, ASCII with those of ``f8``.
+
+    Doubles are ASCII because Open3D reads them as zeros, without a word, from a binary file.
+    """
+    fields: dict[str, tuple[str, NDArray[Any]]] = {
+        name: (coordinates, values) for name, values in zip("xyz", cloud.points.T, strict=True)
+    }
     if cloud.normals is not None:
-        names += ["normal_x", "normal_y", "normal_z"]
-        types += ["f4"] * 3
-        columns += [*cloud.normals.T]
+        names = ("normal_x", "normal_y", "normal_z")
+        fields |= {name: ("f4", values) for name, values in zip(names, cloud.normals.T, strict=True)}
     if cloud.colors is not None:
         red, green, blue = cloud.colors.T.astype(np.uint32)
-        names.append("rgb")
-        types.append("f4")  # the bits of an integer in a float: what every reader of PCD expects
-        columns.append((red << 16 | green << 8 | blue).view(np.float32))
-    rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, code in zip(names, types, strict=True)])
-    for name, values in zip(names, columns, strict=True):
+        fields["rgb"] = ("u4", red << 16 | green << 8 | blue)
+    rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, (code, _) in fields.items()])
+    for name, (_, values) in fields.items():
         rows[name] = values
+
+    codes = [code for code, _ in fields.values()]
     header = (
-        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(names)}\n"
-        f"SIZE {' '.join(code[1] for code in types)}\nTYPE {' '.join('F' for _ in types)}\n"
-        f"COUNT {' '.join('1' for _ in types)}\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
-        f"POINTS {len(rows)}\nDATA binary\n"
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(fields)}\n"
+        f"SIZE {' '.join(code[1] for code in codes)}\nTYPE {' '.join(code[0].upper() for code in codes)}\n"
+        f"COUNT {' '.join('1' for _ in codes)}\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(rows)}\nDATA {'binary' if coordinates == 'f4' else 'ascii'}\n"
     )
-    return header.encode() + rows.tobytes()
+    text = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()) if coordinates == "f8" else ""
+    return header.encode() + (text.encode() or rows.tobytes())
 
 
 def _parse_header(text: str) -> _Header:

@@ -15,7 +15,7 @@ __all__ = ["decode", "encode_csv", "encode_pts", "encode_xyz"]
 
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_EMPTY_FIELD = re.compile(r"^[ \t]*(?=,)|(?<=,)[ \t]*(?=,|$)", re.MULTILINE)
+_BEFORE_EMPTY_FIELD = re.compile(r",(?=[ \t]*(?:,|$))", re.MULTILINE)
 
 
 def decode(data: bytes) -> PointCloud:
@@ -106,14 +106,15 @@ def _is_number(word: str) -> bool:
 def _separate_by_spaces(lines: list[str]) -> list[str]:
     """Rewrite rows with commas or semicolons between fields, or decimal commas; empty fields become NaN."""
     first = lines[0].partition("#")[0]
-    text = "\n".join(lines)
+    text = "\n".join(["", *lines])
     if ";" in first:
         text = text.replace(",", ".").replace(";", ",")
     elif _has_decimal_commas(first):
         return text.replace(",", ".").split("\n")
     elif "," not in first:
         return lines
-    return _EMPTY_FIELD.sub("nan", text).replace(",", " ").split("\n")
+    text = _BEFORE_EMPTY_FIELD.sub(",nan", text).replace("\n,", "\nnan,")
+    return text.replace(",", " ").split("\n")
 
 
 def _columns(cloud: PointCloud) -> dict[str, Numbers]:

@@ -20,12 +20,13 @@ class Significance(nn.Module):
 
     def __init__(self, feature_channels: int, channels: int) -> None:
         super().__init__()
-        self.mlp = nn.Sequential(
-            NormalisedLinear(feature_channels, channels), NormalisedLinear(channels, channels), nn.Linear(channels, 1)
-        )
+        score = nn.Linear(channels, 1)
         # start at the negative entropy of a uniform row of 128 points, so that learning that constant, a large error
         # at first, does not shape the features
-        nn.init.constant_(self.mlp[-1].bias, -math.log(128))
+        nn.init.constant_(score.bias, -math.log(128))
+        self.mlp = nn.Sequential(
+            NormalisedLinear(feature_channels, channels), NormalisedLinear(channels, channels), score
+        )
 
     def forward(self, features: Tensor) -> Tensor:
         """Scores (B, N) of features (B, N, K)."""

@@ -86,7 +86,9 @@ def find(name: str | os.PathLike[str]) -> Path:
     if path.suffix != ".safetensors":
         path = Path(str(_folder() / f"{os.fspath(name)}.safetensors"))
     if not path.is_file():
-        raise InputError(f"unknown model {os.fspath(name)!r}: use one of {_names()}, or the path of a .safetensors file")
+        raise InputError(
+            f"unknown model {os.fspath(name)!r}: use one of {_names()}, or the path of a .safetensors file"
+        )
     return path
 
 

@@ -53,7 +53,7 @@ class SimilarityConvolution(nn.Module):
         """
         weight, bias = self.first.projection()
         k = self.feature_channels
-        for_source, for_target, for_geometry = weight.split([k, k, 4], dim=1)
+        for_source, for_target, for_geometry = weight[:, :k], weight[:, k : 2 * k], weight[:, 2 * k :]
         with torch.autocast(source.device.type, enabled=False):
             geometry = pair_geometry(source, target)
         pairs = F.linear(geometry, for_geometry, bias)

@@ -21,7 +21,7 @@ class Loss(NamedTuple):
         matching: cross-entropy of the similarity rows that have a match.
         entropy: regression of the significance to the negative entropy.
         elimination: binary cross-entropy of the validity.
-        accuracy: share of rows with a match whose argmax lies within r of the truth, in the last iteration.
+        accuracy: share of rows with a match that the last iteration matched within r of the truth.
     """
 
     matching: Tensor
@@ -64,7 +64,7 @@ def mutual_supervision(
     score = iterations[0].score.float()
     entropy = negative_entropy_loss(source_significance.float(), score)
     entropy = entropy + negative_entropy_loss(target_significance.float(), score.transpose(1, 2))
-    right = [is_right(aligned, target, step.correspondence, radius) for step in iterations]
+    right = [is_right(aligned, step.match, radius) for step in iterations]
     elimination = torch.stack(
         [
             F.binary_cross_entropy_with_logits(step.validity_logit.float(), r.float())
@@ -91,7 +91,6 @@ def negative_entropy_loss(significance: Tensor, score: Tensor) -> Tensor:
     return F.mse_loss(significance, (log_similarity.exp() * log_similarity).sum(-1))
 
 
-def is_right(aligned: Tensor, target: Tensor, correspondence: Tensor, radius: float) -> Tensor:
-    """[ |R* p_i + t* - q_argmax|^2 <= r^2 ] (B, M): whether each match is right, the label of the validity (eq. 12)."""
-    match = target.gather(1, correspondence.unsqueeze(-1).expand(-1, -1, 3))
+def is_right(aligned: Tensor, match: Tensor, radius: float) -> Tensor:
+    """[ |R* p_i + t* - p'_i|^2 <= r^2 ] (B, M): whether each match is right, the validity's label (equation 12)."""
     return (aligned - match).square().sum(-1) <= radius**2

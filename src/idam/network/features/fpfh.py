@@ -1,8 +1,8 @@
 """Fast point feature histograms (FPFH): 33 numbers a point that describe the surface around it, whatever its pose.
 
-Rusu, Blodow and Beetz, "Fast Point Feature Histograms (FPFH) for 3D Registration", ICRA 2009, in the form that Open3D's
-``compute_fpfh_feature`` gives it. A pair of neighbours at p and q with unit normals m and n, d the unit vector from p to
-q, is described by three angles, measured in the frame u = m, v = d x u / |d x u|, w = u x v:
+Rusu, Blodow and Beetz, "Fast Point Feature Histograms (FPFH) for 3D Registration", ICRA 2009, as Open3D's
+``compute_fpfh_feature`` computes them. A pair of neighbours at p and q with unit normals m and n, d the unit vector
+from p to q, is described by three angles in the frame u = m, v = d x u / |d x u|, w = u x v:
 
     theta = arctan2(w . n, u . n),    phi = v . n,    alpha = u . d
 
@@ -39,9 +39,11 @@ from idam.network.features.normals import (
 __all__ = ["FPFH", "estimate_normals", "fpfh"]
 
 BINS = 11
-# Angles (radians) closer than this count as equal where an angle jumps: on flat surfaces they would be, and which side
-# of the jump rounding puts them on would depend on the cloud's pose.
-TIE = 1e-4
+# Angles (radians) closer than this count as equal where the outcome jumps: on flat surfaces they often are, and then
+# rounding, and with it the cloud's pose, would decide. (Float32 resolves a sine near zero to 3e-4.)
+TIE = 1e-3
+# Points closer than this coincide: the inverse of its square, and a sum of many, is still a float32.
+SAME_PLACE = 1e-15
 
 
 @torch.no_grad()
@@ -106,12 +108,13 @@ def _fpfh(points: Tensor, normals: Tensor, near: Neighbours) -> Tensor:
     # coordinates first: sums over three slabs of pairs are several times as fast as sums over rows of three
     points, normals = points.flatten(0, 1).t().contiguous(), normals.flatten(0, 1).t().contiguous()
     offset = points.index_select(1, near.neighbour) - points.index_select(1, near.centre)
-    distance = offset.square().sum(0).sqrt_()  # norm(dim=0) is thirty times as slow
-    direction = offset.div_(distance.clamp_min(torch.finfo(points.dtype).tiny))
+    distance = offset.square().sum(0).sqrt_()  # norm(dim=0) is many times as slow
+    coincide = distance < SAME_PLACE
+    direction = offset.div_(distance.clamp_min(SAME_PLACE))
     angles = _pair_angles(direction, normals.index_select(1, near.centre), normals.index_select(1, near.neighbour))
-    spfh = _histograms(angles, near).to(points.dtype)
+    spfh = _histograms(angles.masked_fill_(coincide, 0.5), near).to(points.dtype)
 
-    weight = distance.square().reciprocal_().masked_fill_(distance == 0, 0)
+    weight = distance.square_().reciprocal_().masked_fill_(coincide, 0)
     total = near.sum(torch.cat([spfh, torch.ones_like(spfh[:, :1])], -1), weight)
     neighbours = total[:, :-1] / total[:, -1:].clamp_min(torch.finfo(points.dtype).tiny)
     return (spfh + neighbours).view(*shape, -1)
@@ -120,10 +123,10 @@ def _fpfh(points: Tensor, normals: Tensor, near: Neighbours) -> Tensor:
 def _pair_angles(direction: Tensor, normal: Tensor, other_normal: Tensor) -> Tensor:
     """Theta, phi and alpha of pairs of points, each scaled to [0, 1]: (3, E).
 
-    Pairs at zero distance, or with the normal along the line between them, have no frame and get the middle, 0.5.
+    Pairs with the normal along the line between them have no frame and get the middle, 0.5.
 
     Args:
-        direction: unit vector (3, E) from the first point to the second, zero where they coincide.
+        direction: unit vector (3, E) from the first point to the second.
         normal: the first point's normal (3, E).
         other_normal: the second point's normal (3, E).
     """
@@ -137,7 +140,7 @@ def _pair_angles(direction: Tensor, normal: Tensor, other_normal: Tensor) -> Ten
     theta = torch.where(theta < TIE - math.pi, math.pi, theta)
     phi = _determinant(direction, normal, other_normal) / sine
     angles = torch.stack([theta / math.pi, phi, a]).add_(1).div_(2)
-    return angles.masked_fill_((sine < TIE) | (direction == 0).all(0), 0.5)
+    return angles.masked_fill_(sine < TIE, 0.5)
 
 
 def _determinant(x: Tensor, y: Tensor, z: Tensor) -> Tensor:

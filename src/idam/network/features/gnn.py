@@ -52,7 +52,7 @@ class Graph:
 
 
 class _NeighbourDifference(torch.autograd.Function):
-    """h_i - h_j for every edge: (P, C) -> (K, P, C)."""
+    """See :func:`neighbour_difference`."""
 
     @staticmethod
     def forward(ctx: Any, h: Tensor, neighbours: Tensor, order: Tensor, start: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class _NeighbourDifference(torch.autograd.Function):
 
 
 class _NeighbourMaximum(torch.autograd.Function):
-    """The maximum over neighbours, (K, P, C) -> (P, C); of equal maxima, each receives the gradient."""
+    """See :func:`neighbour_maximum`; of equal maxima, each receives the gradient."""
 
     @staticmethod
     def forward(ctx: Any, y: Tensor) -> Tensor:
@@ -83,7 +83,23 @@ class _NeighbourMaximum(torch.autograd.Function):
         y, maximum = ctx.saved_tensors
         below = y - maximum
         # the gradient where `below` is zero: ReLU's own backward kernel is several times faster than a mask
-        return torch.ops.aten.threshold_backward(gradient.expand_as(below), below, -torch.finfo(below.dtype).tiny)
+        threshold = -torch.finfo(below.dtype).tiny
+        passed: Tensor = torch.ops.aten.threshold_backward(gradient.expand_as(below), below, threshold)
+        return passed
+
+
+def neighbour_difference(h: Tensor, graph: Graph) -> Tensor:
+    """h_i - h_j for every edge of the graph: (P, C) -> (K, P, C)."""
+    difference: Tensor = _NeighbourDifference.apply(  # type: ignore[no-untyped-call] # torch leaves apply untyped
+        h, graph.neighbours, graph.order, graph.start
+    )
+    return difference
+
+
+def neighbour_maximum(y: Tensor) -> Tensor:
+    """The maximum over neighbours: (K, P, C) -> (P, C)."""
+    maximum: Tensor = _NeighbourMaximum.apply(y)  # type: ignore[no-untyped-call] # torch leaves apply untyped
+    return maximum
 
 
 class EdgeLayer(nn.Module):
@@ -101,10 +117,11 @@ class EdgeLayer(nn.Module):
         # in u's own precision, also under autocast: bfloat16 coordinates would not survive the difference
         with torch.autocast(u.device.type, enabled=False):
             h = F.linear(u, weight.to(u.dtype))
-        difference = _NeighbourDifference.apply(h, graph.neighbours, graph.order, graph.start)
+        difference = neighbour_difference(h, graph)
         edges = self.first.finish(difference if bias is None else difference + bias)
         edges = self.second.normalise(F.linear(edges, *self.second.projection()))
-        return self.update(F.relu(_NeighbourMaximum.apply(edges)))
+        updated: Tensor = self.update(F.relu(neighbour_maximum(edges)))
+        return updated
 
 
 class GNN(nn.Module):
