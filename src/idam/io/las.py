@@ -60,10 +60,10 @@ def _read_points(data: bytes) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             reader = laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
-            if reader.header.are_points_compressed:
-                _check_chunks(
-                    data, reader.header.offset_to_point_data, reader.header.vlrs.get("LasZipVlr")[0].record_data
-                )
+            header = reader.header
+            if header.are_points_compressed:
+                description = header.vlrs.get("LasZipVlr")[0].record_data
+                _check_chunks(data, header.offset_to_point_data, header.point_format.size, description)
             return reader.read_points(-1)
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # of lazrs, which is written in Rust; it is no Exception
@@ -90,24 +90,28 @@ def _check_header(data: bytes) -> bool:
     return compressed
 
 
-def _check_chunks(data: bytes, offset: int, description: bytes) -> None:
-    """Refuse a number of compressed chunks, or a length of one, that the file cannot hold."""
+def _check_chunks(data: bytes, offset: int, row: int, description: bytes) -> None:
+    """Refuse compressed points described wrongly, and more or longer chunks of them than the file can hold."""
     check_size(offset + 8, len(data), "compressed points")
     (table,) = struct.unpack_from("<q", data, offset)
-    if table == -1:  # not known when the points were written: it follows them
+    if table == -1:  # not known when the points were written: it is at the end
         (table,) = struct.unpack_from("<q", data, len(data) - 8)
     if not offset <= table <= len(data) - 8:
         raise InputError("cut short: its table of compressed chunks is missing: copy or export it again")
     _, chunks = struct.unpack_from("<II", data, table)
     check_size(chunks, len(data), f"{chunks:,} compressed chunks")
 
-    compressor, items = struct.unpack_from("<H30xH", description)
-    if compressor == 3:  # in layers, whose lengths stand after the first point of a chunk and the number of its points
-        kinds = np.frombuffer(description, "<u2", 3 * items, 34).reshape(items, 3).tolist()
-        first = sum(size for _, size, _ in kinds)
-        layers = sum(_LAYERS.get(kind, size) for kind, size, _ in kinds)
-        at = offset + 8
-        while at < table:
-            lengths = np.frombuffer(data, "<u4", layers, at + first + 4)
-            at += first + 4 + lengths.nbytes + int(lengths.sum(dtype=np.int64))
-            check_size(at, len(data), "a compressed chunk")
+    compressor, chunk_size, items = struct.unpack_from("<H10xI16xH", description)
+    kinds = np.frombuffer(description, "<u2", 3 * items, 34).reshape(items, 3).tolist()
+    if chunk_size == 0 or sum(size for _, size, _ in kinds) != row:
+        raise InputError("damaged: it describes its compressed points wrongly: copy or export it again")
+    if compressor == 3:
+        _check_layers(data, offset + 8, table, row, sum(_LAYERS.get(kind, size) for kind, size, _ in kinds))
+
+
+def _check_layers(data: bytes, at: int, end: int, row: int, layers: int) -> None:
+    """Refuse layers longer than the file: a chunk is a point, the number of points, the layers' lengths, the layers."""
+    while at < end:
+        lengths = np.frombuffer(data, "<u4", layers, at + row + 4)
+        at += row + 4 + lengths.nbytes + int(lengths.sum(dtype=np.int64))
+        check_size(at, len(data), "a compressed chunk")

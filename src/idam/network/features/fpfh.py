@@ -123,7 +123,7 @@ def _fpfh(points: Tensor, normals: Tensor, near: Neighbours) -> Tensor:
 def _pair_angles(direction: Tensor, normal: Tensor, other_normal: Tensor) -> Tensor:
     """Theta, phi and alpha of pairs of points, each scaled to [0, 1]: (3, E).
 
-    Pairs with the normal along the line between them have no frame and get the middle, 0.5.
+    Pairs with the normal along the line between them have no frame and get the middle, 0.5, as in Open3D.
 
     Args:
         direction: unit vector (3, E) from the first point to the second.
@@ -137,7 +137,8 @@ def _pair_angles(direction: Tensor, normal: Tensor, other_normal: Tensor) -> Ten
     sine = (1 - a * a).clamp_min_(0).sqrt_()
 
     theta = torch.atan2(b - a * cosine, sine * cosine)
-    theta = torch.where(theta < TIE - math.pi, math.pi, theta)
+    # opposite normals: -pi and pi are one angle but two bins, and Open3D's rounding mostly picks the first
+    theta = torch.where(theta > math.pi - TIE, -math.pi, theta)
     phi = _determinant(direction, normal, other_normal) / sine
     angles = torch.stack([theta / math.pi, phi, a]).add_(1).div_(2)
     return angles.masked_fill_(sine < TIE, 0.5)

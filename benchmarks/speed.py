@@ -1,0 +1,121 @@
+"""Time of one registration: the network alone, ``register``, and Open3D's classical methods, interleaved in one run.
+
+    python benchmarks/speed.py [--points 1024 2048 4096] [--repeats 15] [--json FILE]
+
+The clouds are two crops of a shape made here, turned by up to 45 degrees, so that no data is needed. Every repeat times
+every method once, in turn, and the table gives medians: on a busy machine compare within a run, never across runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+import idam
+from idam.data.pairs import MAX_ANGLE
+from idam.geometry import euler_xyz_to_rotation
+
+Points = NDArray[np.float32]
+Method = Callable[[Points, Points], object]
+
+
+def make_pair(points: int, seed: int) -> tuple[Points, Points]:
+    """Two clouds of ``points`` points each, about 70 % overlapping, of an asymmetric part."""
+    rng = np.random.default_rng(seed)
+    part = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((1.2, 0.7, 0.3)),
+            trimesh.creation.cylinder(0.25, 0.8).apply_translation((0.3, 0.1, 0.4)),
+            trimesh.creation.icosphere(3, 0.3).apply_translation((-0.45, -0.2, 0.25)),
+        ]
+    )
+    surface = np.asarray(trimesh.sample.sample_surface(part, 3 * points, seed=seed)[0])
+    angles = torch.from_numpy(rng.uniform(0, MAX_ANGLE, 3))
+    rotation = euler_xyz_to_rotation(angles).numpy()
+    direction = np.array([1.0, 0.5, 0.2])
+    order = np.argsort(surface @ direction)
+    source = rng.permutation(surface[order[: 2 * points]])[:points]
+    target = rng.permutation(surface[order[points // 2 :]])[:points] @ rotation.T + 0.1
+    return source.astype(np.float32), target.astype(np.float32)
+
+
+def network(name: str) -> Method:
+    """The network alone."""
+    model = idam.load_model(name)
+
+    @torch.inference_mode()
+    def run(source: Points, target: Points) -> object:
+        return model(torch.from_numpy(source)[None], torch.from_numpy(target)[None])
+
+    return run
+
+
+def open3d_methods() -> dict[str, Method]:
+    """FPFH with RANSAC, and FGR, with the settings published with the paper's rows; empty without Open3D."""
+    try:
+        import open3d as o3d
+    except ImportError as error:
+        print(f"Open3D cannot be imported ({error}): pip install 'idam[benchmark]'")
+        return {}
+    pipeline = o3d.pipelines.registration
+
+    def features(points: Points) -> tuple[object, object]:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.1, 30))
+        return cloud, pipeline.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(0.25, 100))
+
+    def ransac(source: Points, target: Points) -> object:
+        (a, fa), (b, fb) = features(source), features(target)
+        return pipeline.registration_ransac_based_on_feature_matching(a, b, fa, fb, True, 0.05)
+
+    def fgr(source: Points, target: Points) -> object:
+        (a, fa), (b, fb) = features(source), features(target)
+        option = pipeline.FastGlobalRegistrationOption(maximum_correspondence_distance=0.02)
+        return pipeline.registration_fgr_based_on_feature_matching(a, b, fa, fb, option)
+
+    return {"Open3D FPFH+RANSAC": ransac, "Open3D FGR": fgr}
+
+
+def measure(methods: dict[str, Method], points: int, repeats: int) -> dict[str, float]:
+    """Median milliseconds of each method on clouds of ``points`` points."""
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    for repeat in range(repeats + 1):
+        pair = make_pair(points, seed=repeat)
+        for name, method in methods.items():
+            started = time.perf_counter()
+            method(*pair)
+            if repeat > 0:  # the first warms up
+                times[name].append((time.perf_counter() - started) * 1000)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, nargs="+", default=[1024, 2048, 4096])
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    methods: dict[str, Method] = {f"network {name}": network(name) for name in idam.list_models()}
+    methods["idam.register"] = idam.register
+    methods |= open3d_methods()
+    results = {points: measure(methods, points, arguments.repeats) for points in arguments.points}
+    width = max(map(len, methods))
+    print(f"{'median ms':<{width}}" + "".join(f"{points:>10}" for points in results))
+    for name in methods:
+        print(f"{name:<{width}}" + "".join(f"{results[points][name]:>10.1f}" for points in results))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({"threads": torch.get_num_threads(), "median_ms": results}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
