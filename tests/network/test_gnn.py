@@ -114,6 +114,12 @@ def test_translation_does_not_matter(train, seasoned, points, randn, close):
     close(gnn(points + 10 * randn(2, 1, 3)), gnn(points))
 
 
+def test_single_precision_survives_a_large_offset(seasoned, points, close):
+    gnn = seasoned(GNN(neighbours=5), torch.float32)
+    points = (points * 256).round().float() / 256  # the offset loses nothing
+    close(gnn(points + 1000), gnn(points), atol=1e-3)
+
+
 def test_in_evaluation_clouds_do_not_see_each_other(seasoned, points, dtype, close):
     gnn, points = seasoned(GNN(neighbours=5), dtype), points.to(dtype)
     close(gnn(points), torch.cat([gnn(points[:1]), gnn(points[1:])]))
@@ -143,13 +149,13 @@ def test_a_cloud_needs_one_point_more_than_neighbours(randn):
         gnn(randn(1, 12, 3))
 
 
-@MODES
-def test_bfloat16_autocast_stays_close(train, seasoned, points):
+@pytest.mark.parametrize(("train", "error"), [(False, 0.05), (True, 0.2)], ids=["eval", "train"])
+def test_bfloat16_autocast_stays_close(train, error, seasoned, points):
     gnn = seasoned(GNN(neighbours=5), torch.float32, train=train)
     points = points[:, 1:].float() + 30  # an offset that bfloat16 coordinates would not survive
     exact = gnn(points)
     with torch.autocast("cpu", torch.bfloat16):
         rounded = gnn(points)
     rounded.float().square().sum().backward()
-    assert (rounded - exact).norm() < 0.05 * exact.norm()
+    assert (rounded - exact).norm() < error * exact.norm()
     assert all(p.grad.isfinite().all() for p in gnn.parameters())

@@ -79,13 +79,21 @@ def test_few_positives_are_all_taken_and_the_half_filled_up(scene, generator):
     assert all(len(set(row)) == 6 for row in first_half.tolist())
 
 
-@pytest.mark.parametrize(("half", "expected"), [(0, (0.25, 0.0)), (1, (0.0, 0.2))], ids=["positives", "negatives"])
-def test_points_of_a_kind_are_equally_likely(half, expected, scene, generator):
-    source, target = (x.expand(5000, -1, -1) for x in scene(4, 5, batch=1))
+@pytest.mark.parametrize(
+    ("positives", "negatives", "first_half", "second_half"),
+    [
+        (4, 5, [1 / 4] * 4 + [0] * 5, [0] * 4 + [1 / 5] * 5),
+        (0, 5, [1 / 5] * 5, [1 / 5] * 5),
+        (4, 0, [1 / 4] * 4, [1 / 4] * 4),
+    ],
+    ids=["both kinds", "no positives", "no negatives"],
+)
+def test_points_of_a_kind_are_equally_likely(positives, negatives, first_half, second_half, scene, generator):
+    source, target = (x.expand(5000, -1, -1) for x in scene(positives, negatives, batch=1))
     chosen, _ = balanced_sample(source, target, 2, RADIUS, generator)
-    frequency = chosen[:, half].bincount(minlength=9) / 5000
-    probability = torch.tensor([expected[0]] * 4 + [expected[1]] * 5)
-    assert (frequency - probability).abs().max() < 5 * (0.25 * 0.75 / 5000) ** 0.5
+    for drawn, probability in zip(chosen.T, (first_half, second_half), strict=True):
+        frequency = drawn.bincount(minlength=positives + negatives) / 5000
+        assert (frequency - torch.tensor(probability)).abs().max() < 5 * (0.25 * 0.75 / 5000) ** 0.5
 
 
 def test_the_draw_follows_its_generator(scene):

@@ -35,16 +35,16 @@ def scene(randn, generator) -> Scene:
     target = apply_transform(source, rotation, translation)[:, 2:] + 0.02 * randn(2, 6, 3)
     target[:, 4:] += 3
 
-    def iteration() -> Iteration:
+    def iteration(right: int) -> Iteration:
         score = (3 * randn(2, 8, 6)).requires_grad_()
         logit = randn(2, 8).requires_grad_()
         correspondence = score.detach().argmax(-1)
-        correspondence[:, 2:4] = torch.tensor([0, 1])  # some that are right
+        correspondence[:, 2 : 2 + right] = torch.arange(right)
         match = gather_points(target, correspondence)
         return Iteration(randn(2, 8, 3), score, match, correspondence, logit, randn(2, 8), rotation, translation)
 
     significance = randn(2, 8).requires_grad_(), randn(2, 6).requires_grad_()
-    return Scene([iteration() for _ in range(3)], source, target, rotation, translation, *significance)
+    return Scene([iteration(right) for right in (3, 1, 2)], source, target, rotation, translation, *significance)
 
 
 def array(tensor: Tensor) -> np.ndarray:

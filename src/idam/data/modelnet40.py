@@ -61,7 +61,9 @@ def load(folder: str | Path, split: str) -> Shapes:
             with h5py.File(path) as file:
                 points.append(np.asarray(file["data"][:, :POINTS], np.float32))
                 labels.append(np.asarray(file["label"], np.int64).reshape(-1))
-        except (OSError, KeyError) as error:
+            if points[-1].shape != (len(labels[-1]), POINTS, 3):
+                raise ValueError(f"points of shape {points[-1].shape}, {len(labels[-1])} labels")
+        except (OSError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: cannot be read as ModelNet40 HDF5 ({error}); unpack the archive again") from None
     if not points:
         raise InputError(f"{index}: names no files; unpack the archive again")

@@ -6,7 +6,7 @@ import io
 import math
 import warnings
 import zipfile
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -55,9 +55,9 @@ def encode_npy(cloud: PointCloud) -> bytes:
 
 def encode_npz(cloud: PointCloud) -> bytes:
     """Encode the arrays points, colors and normals, as far as the cloud has them."""
+    arrays: dict[str, Any] = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals}
     stream = io.BytesIO()
-    arrays = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals}
-    np.savez(stream, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
+    np.savez(stream, **{name: array for name, array in arrays.items() if array is not None})
     return stream.getvalue()
 
 

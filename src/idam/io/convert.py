@@ -58,7 +58,8 @@ def _from_library(data: Any) -> PointCloud:
     if "open3d" in libraries and hasattr(data, "points"):
         return _with_extras(data.points, data.colors, data.normals)
     if "trimesh" in libraries and hasattr(data, "faces"):
-        return sample_surface(float_rows(data.vertices, "vertices"), np.asarray(data.faces, np.int64))
+        with np.errstate(all="ignore"):  # of vertices that are not finite
+            return sample_surface(float_rows(data.vertices, "vertices"), np.asarray(data.faces, np.int64))
     if "trimesh" in libraries and hasattr(data, "vertices"):
         return _with_extras(data.vertices, getattr(data, "colors", None), None)
     raise InputError(

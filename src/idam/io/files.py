@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
 import os
 import secrets
 import shutil
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,16 @@ import numpy as np
 
 from idam.errors import InputError
 
-__all__ = ["StrPath", "check_unpacked_size", "one_line", "read_bytes", "write_bytes", "write_json", "write_text"]
+__all__ = [
+    "StrPath",
+    "check_unpacked_size",
+    "one_line",
+    "read_bytes",
+    "silenced",
+    "write_bytes",
+    "write_json",
+    "write_text",
+]
 
 StrPath = str | os.PathLike[str]
 
@@ -113,6 +125,20 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+@contextlib.contextmanager
+def silenced(logger: str) -> Iterator[None]:
+    """Keep a library's warnings and log from the user, who gets the error that follows them."""
+    log = logging.getLogger(logger)
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
 
 
 def check_unpacked_size(unpacked: int, packed: int) -> None:

@@ -69,8 +69,9 @@ def read_point_cloud(path: StrPath) -> PointCloud:
 def write_point_cloud(path: StrPath, cloud: Any) -> None:
     """Write a point cloud, atomically: PLY, PCD, XYZ, TXT, ASC, CSV, PTS, NPY or NPZ.
 
-    PLY and PCD are binary, with float32 coordinates, or float64 ones where float32 would round them by more than a
-    millionth of the cloud's extent, far from the origin. Text holds every digit. PTS has no normals, NPY points alone.
+    PLY and PCD are binary, with float32 coordinates. Where that would round them by more than a millionth of the
+    cloud's extent, far from the origin, PLY has float64 ones, and PCD is ASCII. Text holds every digit. PTS has no
+    normals, NPY points alone.
 
     Args:
         path: where to; the extension is the format.

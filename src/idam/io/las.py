@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import struct
-import warnings
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from idam.errors import InputError, MissingDependencyError
 from idam.io.cloud import PointCloud
 from idam.io.columns import Numbers, check_size, cloud_from_columns
-from idam.io.files import check_unpacked_size, one_line
+from idam.io.files import check_unpacked_size, one_line, silenced
 
 __all__ = ["decode"]
 
@@ -57,8 +56,7 @@ def _read_points(data: bytes) -> Any:
     import laspy
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with silenced("laspy"):
             reader = laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
             header = reader.header
             if header.are_points_compressed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import warnings
+import struct
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 from idam.io.cloud import PointCloud
-from idam.io.columns import finite_cloud
+from idam.io.columns import check_size, finite_cloud
+from idam.io.files import silenced
 
 __all__ = ["SAMPLES", "decode_obj", "decode_off", "decode_stl", "fan", "sample_surface", "triangles"]
 
@@ -72,14 +73,18 @@ def decode_off(data: bytes) -> PointCloud:
 
 def decode_stl(data: bytes) -> PointCloud:
     """Sample the surface of an STL mesh, ASCII or binary."""
+    if b"\0" in data:  # binary; trimesh would take a damaged one for ASCII, and find nothing
+        check_size(84, len(data), "a binary STL header")
+        end = 84 + 50 * struct.unpack_from("<I", data, 80)[0]
+        check_size(end, len(data), "binary STL triangles")
+        data = data[:end]
     return _decode(data, "stl")
 
 
 def _decode(data: bytes, file_type: str) -> PointCloud:
     import trimesh
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silenced("trimesh"):
         loaded: Any = trimesh.load(io.BytesIO(data), file_type=file_type, process=False)
     parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)], dtype=np.int64)

@@ -50,28 +50,32 @@ def encode(cloud: PointCloud, coordinates: str) -> bytes:
 
     Doubles are ASCII because Open3D reads them as zeros, without a word, from a binary file.
     """
-    fields: dict[str, tuple[str, NDArray[Any]]] = {
-        name: (coordinates, values) for name, values in zip("xyz", cloud.points.T, strict=True)
-    }
-    if cloud.normals is not None:
-        names = ("normal_x", "normal_y", "normal_z")
-        fields |= {name: ("f4", values) for name, values in zip(names, cloud.normals.T, strict=True)}
-    if cloud.colors is not None:
-        red, green, blue = cloud.colors.T.astype(np.uint32)
-        fields["rgb"] = ("u4", red << 16 | green << 8 | blue)
-    rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, (code, _) in fields.items()])
-    for name, (_, values) in fields.items():
+    fields = _fields(cloud, coordinates)
+    rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, code, _ in fields])
+    for name, _, values in fields:
         rows[name] = values
-
-    codes = [code for code, _ in fields.values()]
+    names, codes, _ = zip(*fields, strict=True)
     header = (
-        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(fields)}\n"
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(names)}\n"
         f"SIZE {' '.join(code[1] for code in codes)}\nTYPE {' '.join(code[0].upper() for code in codes)}\n"
         f"COUNT {' '.join('1' for _ in codes)}\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
         f"POINTS {len(rows)}\nDATA {'binary' if coordinates == 'f4' else 'ascii'}\n"
-    )
-    text = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()) if coordinates == "f8" else ""
-    return header.encode() + (text.encode() or rows.tobytes())
+    ).encode()
+    if coordinates == "f4":
+        return header + rows.tobytes()
+    return header + "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()).encode()
+
+
+def _fields(cloud: PointCloud, coordinates: str) -> list[tuple[str, str, NDArray[Any]]]:
+    """List the name, type and values of each field of a file."""
+    fields: list[tuple[str, str, NDArray[Any]]]
+    fields = [(name, coordinates, values) for name, values in zip("xyz", cloud.points.T, strict=True)]
+    if cloud.normals is not None:
+        fields += [(f"normal_{axis}", "f4", values) for axis, values in zip("xyz", cloud.normals.T, strict=True)]
+    if cloud.colors is not None:
+        red, green, blue = cloud.colors.T.astype(np.uint32)
+        fields.append(("rgb", "u4", red << 16 | green << 8 | blue))
+    return fields
 
 
 def _parse_header(text: str) -> _Header:

@@ -130,7 +130,7 @@ def _read_element(data: bytes, offset: int, element: _Element, unit: str) -> tup
     least = element.count * sum((each.count_type or each.type).itemsize for each in element.properties)
     check_size(least // size, (len(data) - offset) // size, f"{element.count:,} rows of '{element.name}'", unit)
     if least == 0:
-        return {each.name: np.empty(0) for each in element.properties}, offset
+        return {each.name: np.empty(0 if each.count_type is None else (0, 0)) for each in element.properties}, offset
 
     layout = _layout_of_first_row(data, offset, element)
     if element.count * layout.itemsize <= len(data) - offset:
@@ -161,7 +161,7 @@ def _read_rows(data: bytes, offset: int, element: _Element) -> tuple[dict[str, C
     for _ in range(element.count):
         for each, values in zip(element.properties, lists, strict=True):
             length, offset = (1, offset) if each.count_type is None else _read_length(data, offset, each)
-            values.append(np.frombuffer(data, each.type, length, offset))
+            values.append(_take(data, offset, each.type, length))
             offset += length * each.type.itemsize
     properties = zip(element.properties, lists, strict=True)
     columns = [np.concatenate(values) if each.count_type is None else values for each, values in properties]
@@ -181,11 +181,17 @@ def _named(columns: Sequence[Column], element: _Element) -> dict[str, Column]:
 def _read_length(data: bytes, offset: int, each: _Property) -> tuple[int, int]:
     """Read the length of a list, and find where its values start."""
     assert each.count_type is not None
-    length = int(np.frombuffer(data, each.count_type, 1, offset)[0])
+    length = int(_take(data, offset, each.count_type, 1)[0])
     offset += each.count_type.itemsize
-    if not 0 <= length * each.type.itemsize <= len(data) - offset:
-        raise InputError(f"damaged: a list '{each.name}' of {length:,} values: copy or export it again")
+    if length < 0:
+        raise InputError(f"damaged: a list '{each.name}' of {length:,} values: export it again")
+    check_size(length * each.type.itemsize, len(data) - offset, f"a list '{each.name}' of {length:,} values")
     return length, offset
+
+
+def _take(data: bytes, offset: int, kind: np.dtype[Any], count: int) -> NDArray[Any]:
+    check_size(count * kind.itemsize, len(data) - offset, "more rows")
+    return np.frombuffer(data, kind, count, offset)
 
 
 def _faces(face: dict[str, Column]) -> NDArray[np.int64]:

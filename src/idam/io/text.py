@@ -32,7 +32,13 @@ def decode(data: bytes) -> PointCloud:
     text = data.removeprefix(_BYTE_ORDER_MARK).decode("latin-1").replace("//", "#").replace('"', "")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     names, count, first = _parse_header(lines)
-    table = np.loadtxt(_separate_by_spaces(lines[first:]), np.float64, comments="#", ndmin=2)
+    try:
+        table = np.loadtxt(_separate_by_spaces(lines[first:]), np.float64, comments="#", ndmin=2)
+    except ValueError as error:
+        fault = str(error).partition(";")[0]
+        raise InputError(
+            f"damaged: {fault}, counted from its first point: mend that line or export it again"
+        ) from error
     if table.shape[1] < 3:
         raise InputError(f"its lines hold {table.shape[1]} numbers, expected x y z: export it with coordinates")
     if count is not None:
@@ -73,7 +79,7 @@ def _parse_header(lines: list[str]) -> tuple[list[str] | None, int | None, int]:
             names = words if words[0].casefold() == "x" and has_positions(words) else names
         elif not all(map(_is_number, words)):
             if not has_positions(words):
-                raise InputError(f"line {index + 1} holds neither numbers nor names of columns among them x, y and z")
+                raise InputError(f"line {index + 1} is neither numbers nor names of columns: write lines of x y z")
             names = words
         elif len(words) == 1 and count is None and words[0].isdecimal():
             count = int(words[0])

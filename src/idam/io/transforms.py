@@ -68,7 +68,11 @@ def write_transform(path: StrPath, T: ArrayLike) -> None:
 
 def _decode_json(data: bytes) -> NDArray[np.float64]:
     content: Any = json.loads(data)
-    return np.asarray(content["transformation"] if isinstance(content, dict) else content, np.float64)
+    if isinstance(content, dict):
+        if "transformation" not in content:
+            raise InputError('no key "transformation"')
+        content = content["transformation"]
+    return np.asarray(content, np.float64)
 
 
 def _decode_npy(data: bytes) -> NDArray[np.float64]:

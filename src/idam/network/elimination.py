@@ -65,6 +65,6 @@ def hybrid_weights(validity: Tensor, keep: float) -> Tensor:
         validity: v (B, M) in [0, 1].
         keep: share of matches that stay; 0.5 is the paper's median cut.
     """
-    threshold = validity.float().quantile(1.0 - keep, dim=-1, keepdim=True, interpolation="lower").to(validity.dtype)
+    threshold = validity.quantile(1.0 - keep, dim=-1, keepdim=True, interpolation="lower")
     weight = torch.where(validity >= threshold, validity, 0.0)
     return weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)

@@ -160,7 +160,9 @@ class IDAM(nn.Module):
     def match(self, source: KeyPoints, target: KeyPoints) -> Output:
         """Register key points: :meth:`forward` from hard elimination on."""
         iterations = self.iterate(source.points, target.points, source.features, target.features)
-        return Output(*chain(iterations), iterations, source, target)
+        with torch.autocast(source.points.device.type, enabled=False):
+            rotation, translation = chain(iterations)
+        return Output(rotation, translation, iterations, source, target)
 
     def iterate(
         self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor

@@ -53,9 +53,13 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
 
 def provenance(name: str | os.PathLike[str]) -> dict[str, Any]:
     """How a model came about: experiment, data, seed, command, commit, steps and scores."""
-    with safe_open(find(name), "pt") as file:
-        metadata = file.metadata() or {}
-    return {"config": json.loads(metadata["config"]), **json.loads(metadata.get("provenance", "{}"))}
+    path = find(name)
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+        return {"config": json.loads(metadata["config"]), **json.loads(metadata.get("provenance", "{}"))}
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not a model that idam wrote ({error})") from None
 
 
 def save_model(path: Path, model: IDAM, provenance: dict[str, Any]) -> None:
@@ -67,9 +71,12 @@ def save_model(path: Path, model: IDAM, provenance: dict[str, Any]) -> None:
     state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
     metadata = {"config": json.dumps(asdict(model.config)), "provenance": json.dumps(provenance)}
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-            file.write(save(state, metadata))
-        Path(file.name).replace(path)
+        partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            partial.write_bytes(save(state, metadata))
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
 
