@@ -16,9 +16,6 @@ __all__ = ["Hypothesis", "propose", "starting_rotations"]
 
 Points = NDArray[np.float64]
 
-PAIRS_AT_ONCE = 400_000
-"""Pairs of key points in one pass of the similarity convolution: bounds the memory to some hundred megabytes."""
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -65,14 +62,10 @@ def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor)
     source_points = torch.as_tensor(source, dtype=torch.float32, device=device)[None]
     target_points = torch.as_tensor(target, dtype=torch.float32, device=device)[None]
     target_keys = network.eliminate(target_points, network.features(target_points))
-    pairs = len(source) * len(target) * network.config.keep**2
-    at_once = max(1, int(PAIRS_AT_ONCE / max(1.0, pairs)))
-    hypotheses: list[Hypothesis] = []
-    for some in torch.split(starts.to(device), at_once):
-        turned = source_points @ some.transpose(-1, -2)
-        source_keys = network.eliminate(turned, network.features(turned))
-        hypotheses += _run(network, source_keys, _repeat(target_keys, len(some)), some)
-    return hypotheses
+    starts = starts.to(device)
+    turned = source_points @ starts.transpose(-1, -2)
+    source_keys = network.eliminate(turned, network.features(turned))
+    return _run(network, source_keys, _repeat(target_keys, len(starts)), starts)
 
 
 def _repeat(keys: KeyPoints, count: int) -> KeyPoints:

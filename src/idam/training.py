@@ -20,6 +20,7 @@ from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform, gather_points
 from idam.memory import keep_freed_memory
+from idam.network.elimination import keep_most_significant
 from idam.network.model import IDAM, Config, KeyPoints
 from idam.network.pretrained import load_model, save_model
 from idam.network.sampling import balanced_sample
@@ -46,8 +47,8 @@ class Recipe:
         weight_decay: Adam's.
         radius: r of the loss and of balanced sampling.
         keep: share of points that balanced sampling draws.
-        eliminate_targets: match the sampled sources against the target points that hard elimination keeps, as after
-            training, rather than against the sources' nearest target points.
+        eliminate: let hard elimination choose the target points, and half of the source points, as it does after
+            training; balanced sampling chooses the other half.
         start: name or file of a model whose weights to start from; None for random ones.
         seed: of the weights, pairs and samples.
     """
@@ -61,7 +62,7 @@ class Recipe:
     weight_decay: float = 1e-3
     radius: float = 0.05
     keep: float = 1 / 6
-    eliminate_targets: bool = False
+    eliminate: bool = False
     start: str | None = None
     seed: int = 0
 
@@ -107,10 +108,7 @@ class SupervisedStep(nn.Module):
         with torch.autocast(batch.source.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             source_features, target_features = self.model.encode(batch.source, batch.target)
             source = self._sample(batch.source, source_features, batch.source_index)
-            if self.recipe.eliminate_targets:
-                target = self.model.eliminate(batch.target, target_features)
-            else:
-                target = self._sample(batch.target, target_features, batch.target_index)
+            target = self._sample(batch.target, target_features, batch.target_index, all_eliminated=True)
             iterations = self.model.iterate(source.points, target.points, source.features, target.features)
         return mutual_supervision(
             iterations,
@@ -123,8 +121,13 @@ class SupervisedStep(nn.Module):
             self.recipe.radius,
         )
 
-    def _sample(self, points: Tensor, features: Tensor, index: Tensor) -> KeyPoints:
+    def _sample(self, points: Tensor, features: Tensor, index: Tensor, *, all_eliminated: bool = False) -> KeyPoints:
         significance = self.model.significance(features)
+        if self.recipe.eliminate:
+            kept = keep_most_significant(significance.detach(), self.model.config.keep)
+            half = index.shape[1] // 2
+            # balanced samples come positives first: every second one keeps the balance
+            index = kept if all_eliminated else torch.cat([index[:, ::2], kept[:, :half]], 1)
         return KeyPoints(gather_points(points, index), gather_points(features, index), index, significance)
 
 

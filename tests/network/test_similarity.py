@@ -42,12 +42,22 @@ def direct(linear_norm_relu):
 @MODES
 def test_the_convolution_is_its_definition(train, seasoned, clouds, direct, dtype, close):
     module = seasoned(SimilarityConvolution(10, 8), dtype, train=train)
-    pairs, score = module(*clouds)
+    pairs = module.pair_features(*clouds)
+    maximum, score = module(*clouds)
     assert pairs.shape == (2, 7, 9, 8)
     assert score.shape == (2, 7, 9)
     expected_pairs, expected_score = direct(module, *clouds)
     close(pairs, expected_pairs)
+    close(maximum, expected_pairs.amax(2))
     close(score, expected_score)
+
+
+def test_rows_a_few_at_a_time_are_rows_all_at_once(seasoned, clouds, close, monkeypatch):
+    module = seasoned(SimilarityConvolution(10, 8), clouds[0].dtype)
+    together = module(*clouds)
+    monkeypatch.setattr("idam.network.similarity.PAIRS_IN_CACHE", 40)
+    for rows, expected in zip(module(*clouds), together, strict=True):
+        close(rows, expected)
 
 
 @MODES

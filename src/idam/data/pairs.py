@@ -113,4 +113,6 @@ def _nearest_to(points: Tensor, far: Tensor) -> Tensor:
     """The points (B, 768, 3) of (B, N, 3) nearest to one far point each (B, 3)."""
     # |p - f|^2 = |p|^2 - 2 p.f + const: without the constant, which would swallow single precision
     distance = points.square().sum(-1) - 2 * (points @ far.unsqueeze(-1)).squeeze(-1)
-    return gather_points(points, distance.topk(min(CROPPED_POINTS, points.shape[1]), largest=False).indices.sort(-1).values)
+    return gather_points(
+        points, distance.topk(min(CROPPED_POINTS, points.shape[1]), largest=False).indices.sort(-1).values
+    )

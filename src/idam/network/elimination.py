@@ -52,9 +52,9 @@ class Validity(nn.Module):
         super().__init__()
         self.mlp = nn.Sequential(NormalisedLinear(channels, channels), nn.Linear(channels, 1))
 
-    def forward(self, pairs: Tensor) -> Tensor:
-        """Logits (B, M) of the validity from pair features (B, M, L, channels)."""
-        logits: Tensor = self.mlp(pairs.amax(2))
+    def forward(self, maximum: Tensor) -> Tensor:
+        """Logits (B, M) of the validity from the maximum of each point's pair features, (B, M, channels)."""
+        logits: Tensor = self.mlp(maximum)
         return logits.squeeze(-1)
 
 

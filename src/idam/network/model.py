@@ -171,8 +171,8 @@ class IDAM(nn.Module):
         iterations: list[Iteration] = []
         for n in range(self.config.iterations):
             block = min(n, self.config.blocks - 1)
-            pairs, score = self.similarity[block](source, target, source_features, target_features)
-            step = self._solve(source, target, score, self.validity[block](pairs))
+            maximum, score = self.similarity[block](source, target, source_features, target_features)
+            step = self._solve(source, target, score, self.validity[block](maximum))
             iterations.append(step)
             with torch.autocast(source.device.type, enabled=False):
                 source = apply_transform(source, step.rotation, step.translation)

@@ -19,6 +19,9 @@ from idam.network.layers import NormalisedLinear
 
 __all__ = ["SimilarityConvolution", "pair_geometry"]
 
+PAIRS_IN_CACHE = 32768
+"""Pairs that go through the convolutions at once in evaluation: their features, 4 MB, stay near the cores."""
+
 
 def pair_geometry(source: Tensor, target: Tensor) -> Tensor:
     """Distance and direction (B, M, L, 4) of every pair of source (B, M, 3) and target (B, L, 3) points.
@@ -43,7 +46,7 @@ class SimilarityConvolution(nn.Module):
     def forward(
         self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Pair features F (B, M, L, channels) and scores (B, M, L), before the softmax over L.
+        """Each source point's maximum of pair features, (B, M, channels), and the scores (B, M, L) before the softmax.
 
         Args:
             source: points (B, M, 3).
@@ -51,15 +54,28 @@ class SimilarityConvolution(nn.Module):
             source_features: (B, M, K).
             target_features: (B, L, K).
         """
+        # a few rows at a time stay in the cache; in training the normalisation needs all pairs at once
+        rows = source.shape[1] if self.training else max(1, PAIRS_IN_CACHE // (len(source) * target.shape[1]))
+        maxima, scores = [], []
+        for some, some_features in zip(
+            torch.split(source, rows, 1), torch.split(source_features, rows, 1), strict=True
+        ):
+            pairs = self.pair_features(some, target, some_features, target_features)
+            maxima.append(pairs.amax(2))
+            scores.append(self.score(pairs).squeeze(-1))
+        return torch.cat(maxima, 1), torch.cat(scores, 1)
+
+    def pair_features(self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor) -> Tensor:
+        """F(i, j), (B, M, L, channels), of every pair; the arguments are those of :meth:`forward`."""
         weight, bias = self.first.projection()
         k = self.feature_channels
         for_source, for_target, for_geometry = weight[:, :k], weight[:, k : 2 * k], weight[:, 2 * k :]
         with torch.autocast(source.device.type, enabled=False):
             geometry = pair_geometry(source, target)
         pairs = F.linear(geometry, for_geometry, bias)
-        pairs = pairs + F.linear(source_features, for_source).unsqueeze(2)
-        pairs = pairs + F.linear(target_features, for_target).unsqueeze(1)
+        pairs += F.linear(source_features, for_source).unsqueeze(2)
+        pairs += F.linear(target_features, for_target).unsqueeze(1)
         pairs = self.first.finish(pairs)
         for layer in self.hidden:
             pairs = layer(pairs)
-        return pairs, self.score(pairs).squeeze(-1)
+        return pairs

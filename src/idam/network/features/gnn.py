@@ -13,7 +13,6 @@ scatter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -23,49 +22,38 @@ from torch import Tensor, nn
 from idam.geometry import nearest_neighbours
 from idam.network.layers import NormalisedLinear
 
-__all__ = ["GNN", "Graph"]
+__all__ = ["GNN", "EdgeLayer", "neighbour_graph"]
 
 
-@dataclass(frozen=True)
-class Graph:
-    """The neighbours of every point of a batch, by row number in the flattened batch of P = B N points.
+def neighbour_graph(points: Tensor, k: int) -> Tensor:
+    """The k nearest neighbours of every point of a batch of clouds (B, N, 3).
 
-    Attributes:
-        neighbours: (K, P), the neighbours of each point.
-        order: (K P,), the edges sorted by the neighbour they point to.
-        start: (P,), where each neighbour's edges begin in ``order``.
+    Returns:
+        (k, P): rows of the flattened batch of P = B N points; each cloud is on its own.
     """
-
-    neighbours: Tensor
-    order: Tensor
-    start: Tensor
-
-    @classmethod
-    def build(cls, points: Tensor, k: int) -> Graph:
-        """The k-nearest-neighbour graph of points (B, N, 3), each cloud on its own."""
-        batch, count, _ = points.shape
-        offset = torch.arange(batch, device=points.device).view(-1, 1, 1) * count
-        neighbours = (nearest_neighbours(points, k) + offset).view(-1, k).t().contiguous()
-        flat = neighbours.flatten()
-        edges = torch.bincount(flat, minlength=batch * count)
-        return cls(neighbours, flat.argsort(), edges.cumsum(0) - edges)
+    batch, count, _ = points.shape
+    offset = torch.arange(batch, device=points.device).view(-1, 1, 1) * count
+    return (nearest_neighbours(points, k) + offset).view(-1, k).t().contiguous()
 
 
 class _NeighbourDifference(torch.autograd.Function):
     """See :func:`neighbour_difference`."""
 
     @staticmethod
-    def forward(ctx: Any, h: Tensor, neighbours: Tensor, order: Tensor, start: Tensor) -> Tensor:
-        ctx.save_for_backward(order, start)
-        return h - F.embedding(neighbours, h)
+    def forward(ctx: Any, centre: Tensor, h: Tensor, neighbours: Tensor) -> Tensor:
+        ctx.save_for_backward(neighbours)
+        return centre - F.embedding(neighbours, h)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         (gradient,) = gradients
-        order, start = ctx.saved_tensors
-        as_centre = gradient.sum(0)
-        as_neighbour = F.embedding_bag(order, gradient.flatten(0, 1), start, mode="sum")
-        return as_centre - as_neighbour, None, None, None
+        neighbours = ctx.saved_tensors[0].flatten()
+        # the edges sorted by the neighbour they point to: one sum of a run for each point, and no scatter
+        edges = torch.bincount(neighbours, minlength=gradient.shape[1])
+        as_neighbour = F.embedding_bag(
+            neighbours.argsort(), gradient.flatten(0, 1), edges.cumsum(0) - edges, mode="sum"
+        )
+        return gradient.sum(0), -as_neighbour, None
 
 
 class _NeighbourMaximum(torch.autograd.Function):
@@ -88,17 +76,15 @@ class _NeighbourMaximum(torch.autograd.Function):
         return passed
 
 
-def neighbour_difference(h: Tensor, graph: Graph) -> Tensor:
-    """h_i - h_j for every edge of the graph: (P, C) -> (K, P, C)."""
-    difference: Tensor = _NeighbourDifference.apply(  # type: ignore[no-untyped-call] # torch leaves apply untyped
-        h, graph.neighbours, graph.order, graph.start
-    )
+def neighbour_difference(centre: Tensor, h: Tensor, neighbours: Tensor) -> Tensor:
+    """centre_i - h_j for every edge, (K, P, C), of two (P, C), with the neighbours (K, P) of the graph."""
+    difference: Tensor = _NeighbourDifference.apply(centre, h, neighbours)  # type: ignore[no-untyped-call] # torch's own
     return difference
 
 
 def neighbour_maximum(y: Tensor) -> Tensor:
     """The maximum over neighbours: (K, P, C) -> (P, C)."""
-    maximum: Tensor = _NeighbourMaximum.apply(y)  # type: ignore[no-untyped-call] # torch leaves apply untyped
+    maximum: Tensor = _NeighbourMaximum.apply(y)  # type: ignore[no-untyped-call] # torch's own
     return maximum
 
 
@@ -111,14 +97,14 @@ class EdgeLayer(nn.Module):
         self.second = NormalisedLinear(out_channels, out_channels)
         self.update = NormalisedLinear(out_channels, out_channels)
 
-    def forward(self, u: Tensor, graph: Graph) -> Tensor:
-        """Features (P, in) and their graph to features (P, out)."""
+    def forward(self, u: Tensor, neighbours: Tensor) -> Tensor:
+        """Features (P, in) and neighbours (K, P) to features (P, out)."""
         weight, bias = self.first.projection()
         # in u's own precision, also under autocast: bfloat16 coordinates would not survive the difference
         with torch.autocast(u.device.type, enabled=False):
             h = F.linear(u, weight.to(u.dtype))
-        difference = neighbour_difference(h, graph)
-        edges = self.first.finish(difference if bias is None else difference + bias)
+        centre = h if bias is None else h + bias
+        edges = self.first.finish(neighbour_difference(centre, h, neighbours))
         edges = self.second.normalise(F.linear(edges, *self.second.projection()))
         updated: Tensor = self.update(F.relu(neighbour_maximum(edges)))
         return updated
@@ -145,8 +131,8 @@ class GNN(nn.Module):
         # neighbours and differences of coordinates need full precision also under autocast
         with torch.autocast(points.device.type, enabled=False):
             centred = points - points.mean(1, keepdim=True)
-            graph = Graph.build(centred.detach(), self.neighbours)
+            neighbours = neighbour_graph(centred.detach(), self.neighbours)
         u = centred.flatten(0, 1)
         for layer in self.layers:
-            u = layer(u, graph)
+            u = layer(u, neighbours)
         return u.view(*points.shape[:2], -1)
