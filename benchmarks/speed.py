@@ -13,7 +13,9 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,13 +64,14 @@ def network(name: str) -> Method:
 def open3d_methods() -> dict[str, Method]:
     """FPFH with RANSAC, and FGR, with the settings published with the paper's rows; empty without Open3D."""
     try:
-        import open3d as o3d
+        # by name: whether its stubs are installed must not change the verdict on types
+        o3d: Any = import_module("open3d")
     except ImportError as error:
         print(f"Open3D cannot be imported ({error}): pip install 'idam[benchmark]'")
         return {}
     pipeline = o3d.pipelines.registration
 
-    def features(points: Points) -> tuple[object, object]:
+    def features(points: Points) -> tuple[Any, Any]:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.1, 30))
         return cloud, pipeline.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(0.25, 100))
