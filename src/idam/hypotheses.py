@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from idam.geometry import compose, random_rotation
+from idam.geometry import compose, gather_points, random_rotation
 from idam.network.model import IDAM, KeyPoints
 from idam.result import Matches
 
@@ -59,22 +59,22 @@ def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor)
         starts: rotations applied to the source before the network sees it.
     """
     device = next(network.parameters()).device
-    source_points = torch.as_tensor(source, dtype=torch.float32, device=device)[None]
-    target_points = torch.as_tensor(target, dtype=torch.float32, device=device)[None]
-    target_keys = network.eliminate(target_points, network.features(target_points))
     starts = starts.to(device)
-    turned = source_points @ starts.transpose(-1, -2)
-    source_keys = network.eliminate(turned, network.features(turned))
-    return _run(network, source_keys, _repeat(target_keys, len(starts)), starts)
+    target_keys = _key_points(network, target, torch.eye(3, device=device).expand_as(starts), same=True)
+    source_keys = _key_points(network, source, starts, same=network.features.rotation_invariant)
+    return _run(network, source_keys, target_keys, starts)
 
 
-def _repeat(keys: KeyPoints, count: int) -> KeyPoints:
-    return KeyPoints(
-        keys.points.expand(count, -1, -1),
-        keys.features.expand(count, -1, -1),
-        keys.index.expand(count, -1),
-        keys.significance.expand(count, -1),
+def _key_points(network: IDAM, points: Points, turns: torch.Tensor, *, same: bool) -> KeyPoints:
+    """Key points of a cloud (N, 3) under each of S rotations (S, 3, 3), described once where all are the same."""
+    cloud = torch.as_tensor(points, dtype=torch.float32, device=turns.device)[None]
+    turned = cloud @ turns.transpose(-1, -2)
+    described = cloud if same else turned
+    keys = network.eliminate(described, network.features(described))
+    index, features, significance = (
+        x.expand(len(turns), *x.shape[1:]) for x in (keys.index, keys.features, keys.significance)
     )
+    return KeyPoints(gather_points(turned, index), features, index, significance)
 
 
 def _run(network: IDAM, source: KeyPoints, target: KeyPoints, starts: torch.Tensor) -> list[Hypothesis]:

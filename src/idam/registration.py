@@ -18,7 +18,7 @@ from idam.errors import InputError
 from idam.hypotheses import propose, starting_rotations
 from idam.io import as_point_cloud
 from idam.network.model import IDAM
-from idam.network.pretrained import load_model
+from idam.network.pretrained import find, load_model
 from idam.preprocess import MIN_POINTS, Frame, check_points, choose_voxel_size, common_frame, downsample
 from idam.ranking import Answer, Surfaces, distinct, improve
 from idam.refine import METHODS, Refinable
@@ -60,7 +60,7 @@ def register(
         source: a path, an (N, 3) array or tensor, or an Open3D or trimesh cloud; in any unit, of any size.
         target: likewise, in the same unit.
         model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them.
-        init: (4, 4), a guess of the transform to try beside the network's own starts.
+        init: (4, 4), a guess of the transform: an answer to consider, and where the network's starts turn around.
         voxel_size: of the clouds the network sees, in the input's units; None takes it from the data.
         max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for the spacing
             of the points the clouds were scored on.
@@ -88,11 +88,14 @@ def register(
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
     hypotheses = propose(network, small.source, small.target, starts)
     method = refine or "none"
-    answers = [Answer(h.transformation, h) for h in hypotheses]
+    answers = [Answer(hypothesis.transformation, hypothesis) for hypothesis in hypotheses]
+    if init is not None:
+        answers.append(Answer(guess, hypotheses[0]))
     answers = distinct(improve(answers, small.surfaces(), 4.0, method))[:CONTENDERS]
     answers = distinct(improve(answers, dense.surfaces(), 2.0, method))
     transformation, information = finish(answers[0], fine, method)
     full = frame.undo(transformation)
+    evidence = gather_evidence(answers, small.spacing)
     distance = max_correspondence_distance or dense.spacing * frame.scale
     moved = source_points @ full[:3, :3].T + full[:3, 3]
     correspondence_set, rmse = inliers(moved, target_points, distance)
@@ -101,11 +104,12 @@ def register(
         fitness=len(correspondence_set) / len(source_points),
         inlier_rmse=rmse,
         correspondence_set=correspondence_set,
-        confidence=confidence(gather_evidence(answers, small.spacing)),
+        confidence=confidence(evidence),
+        evidence=evidence,
         max_correspondence_distance=distance,
         information=information,
         matches=in_input_units(answers[0].hypothesis.matches, frame),
-        model=os.fspath(model),
+        model=find(model).stem,
         seconds=time.perf_counter() - started,
     )
 

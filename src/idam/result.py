@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from idam.confidence import Evidence
 
 __all__ = ["Matches", "RegistrationResult"]
 
@@ -37,6 +39,7 @@ class RegistrationResult:
         inlier_rmse: root mean square distance of those pairs, in the input's units.
         correspondence_set: (C, 2) rows of source and target of those pairs.
         confidence: probability in [0, 1] that the transform is right.
+        evidence: what the confidence was computed from.
         max_correspondence_distance: the distance the above were measured at, in the input's units.
         information: (6, 6) information matrix of the fine alignment, rotation before translation; zero if it was off.
         matches: the network's weighted matches of key points.
@@ -49,6 +52,7 @@ class RegistrationResult:
     inlier_rmse: float
     correspondence_set: NDArray[np.int64]
     confidence: float
+    evidence: Evidence = field(repr=False)
     max_correspondence_distance: float
     information: NDArray[np.float64] = field(repr=False)
     matches: Matches = field(repr=False)
@@ -82,6 +86,7 @@ class RegistrationResult:
             "correspondences": len(self.correspondence_set),
             "max_correspondence_distance": self.max_correspondence_distance,
             "confidence": self.confidence,
+            "evidence": asdict(self.evidence),
             "information": self.information.tolist(),
             "model": self.model,
             "seconds": self.seconds,

@@ -80,6 +80,7 @@ class FPFH(nn.Module):
     """
 
     channels = 3 * BINS
+    rotation_invariant = True
 
     def __init__(
         self,

@@ -114,6 +114,7 @@ class GNN(nn.Module):
     """Five edge layers of 64 channels on the graph of the ``neighbours`` nearest points (appendix A)."""
 
     channels = 64
+    rotation_invariant = False
 
     def __init__(self, neighbours: int = 12, layers: int = 5) -> None:
         super().__init__()
