@@ -181,6 +181,10 @@ def train(
     batch_size: Annotated[int, typer.Option(help="Pairs a step, over all processes.")] = 16,
     schedule: Annotated[str, typer.Option(help="step (the paper's) or one-cycle.")] = "step",
     learning_rate: Annotated[float, typer.Option(help="Adam's, at its highest.")] = 1e-4,
+    start: Annotated[str | None, typer.Option(help="Name or file of a model whose weights to start from.")] = None,
+    eliminate: Annotated[
+        bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Of the weights, pairs and samples.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     precision: Annotated[str, typer.Option(help="32 or bf16.")] = "32",
@@ -208,6 +212,8 @@ def train(
         batch_size=batch_size,
         schedule=schedule,
         learning_rate=learning_rate,
+        start=start,
+        eliminate=eliminate,
         seed=seed,
     )
     best = run(

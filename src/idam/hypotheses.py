@@ -82,15 +82,13 @@ def _run(network: IDAM, source: KeyPoints, target: KeyPoints, starts: torch.Tens
     rotation, translation = compose(output.rotation, output.translation, starts, torch.zeros_like(output.translation))
     last = output.iterations[-1]
     keys = source.points @ starts
-    kept = last.weight > 0
-    validity = (last.validity * kept).sum(-1) / kept.sum(-1).clamp_min(1)
     hypotheses = []
     for n in range(len(starts)):
         transformation = np.eye(4)
         transformation[:3, :3] = _nearest_rotation(rotation[n].double().cpu().numpy())
         transformation[:3, 3] = translation[n].double().cpu().numpy()
         matches = Matches(*(x[n].double().cpu().numpy() for x in (keys, last.match, last.weight)))
-        hypotheses.append(Hypothesis(transformation, matches, float(validity[n])))
+        hypotheses.append(Hypothesis(transformation, matches, float(output.trust[n])))
     return hypotheses
 
 

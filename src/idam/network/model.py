@@ -15,6 +15,10 @@ from idam.network.similarity import SimilarityConvolution
 __all__ = ["IDAM", "Config", "Iteration", "KeyPoints", "Output"]
 
 
+TRUSTED = 0.9
+"""Mean validity of the last iteration's matches from which no other try is made."""
+
+
 @dataclass(frozen=True)
 class Config:
     """What makes one IDAM different from another; the defaults are the paper's.
@@ -28,6 +32,9 @@ class Config:
         blocks: iterations that have weights of their own.
         iterations: iterations run; those past ``blocks`` use the last block's weights again.
         keep: share of each cloud's points that hard elimination keeps.
+        keep_again: shares to try next, in turn, where the validity says that the matches are not to be trusted; the
+            iterations run twice as often then. Empty is the paper's inference. Beyond it, since of two clouds' most
+            significant points too few may be the same: the validity notices, and more points mend it.
         keep_matches: share of matches that hybrid elimination keeps.
         soft_matches: match a point to its row's expectation (the mean of the target, weighted by similarity) rather
             than to the row's best target point.
@@ -41,6 +48,7 @@ class Config:
     blocks: int = 3
     iterations: int = 3
     keep: float = 1 / 6
+    keep_again: tuple[float, ...] = ()
     keep_matches: float = 0.5
     soft_matches: bool = False
 
@@ -107,6 +115,10 @@ class Output:
         iterations: what each iteration saw and did.
         source: its key points, where it was given.
         target: its key points.
+        trust: mean validity of the matches that kept a weight in the last iteration, (B,), in [0, 1].
+
+    Where the configuration tries again, each pair has the transform and the trust of its best try; iterations and key
+    points are those of the last try that any pair of the batch took.
     """
 
     rotation: Tensor
@@ -114,6 +126,7 @@ class Output:
     iterations: list[Iteration]
     source: KeyPoints
     target: KeyPoints
+    trust: Tensor
 
 
 class IDAM(nn.Module):
@@ -141,8 +154,14 @@ class IDAM(nn.Module):
             The transform, with everything each iteration saw. Scores and validity are differentiable in the weights;
             the transform is not: no gradient passes the SVD (section 3.4).
         """
-        source_features, target_features = self.encode(source, target)
-        return self.match(self.eliminate(source, source_features), self.eliminate(target, target_features))
+        features = self.encode(source, target)
+        output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
+        for keep in self.config.keep_again:
+            if bool((output.trust >= TRUSTED).all()):
+                break
+            key_points = self.eliminate(source, features[0], keep), self.eliminate(target, features[1], keep)
+            output = better(output, self.match(*key_points, 2 * self.config.iterations))
+        return output
 
     def encode(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, N, K) and (B, P, K) of both clouds; equally large clouds go through as one batch."""
@@ -151,25 +170,32 @@ class IDAM(nn.Module):
             return source_features, target_features
         return self.features(source), self.features(target)
 
-    def eliminate(self, points: Tensor, features: Tensor) -> KeyPoints:
+    def eliminate(self, points: Tensor, features: Tensor, keep: float | None = None) -> KeyPoints:
         """Hard elimination: the most significant of the points (B, N, 3) with features (B, N, K)."""
         significance = self.significance(features)
-        index = keep_most_significant(significance, self.config.keep)
+        index = keep_most_significant(significance, self.config.keep if keep is None else keep)
         return KeyPoints(gather_points(points, index), gather_points(features, index), index, significance)
 
-    def match(self, source: KeyPoints, target: KeyPoints) -> Output:
-        """Register key points: :meth:`forward` from hard elimination on."""
-        iterations = self.iterate(source.points, target.points, source.features, target.features)
+    def match(self, source: KeyPoints, target: KeyPoints, count: int | None = None) -> Output:
+        """Register key points, in ``count`` iterations: one try of :meth:`forward` from hard elimination on."""
+        iterations = self.iterate(source.points, target.points, source.features, target.features, count)
         with torch.autocast(source.points.device.type, enabled=False):
             rotation, translation = chain(iterations)
-        return Output(rotation, translation, iterations, source, target)
+        kept = iterations[-1].weight > 0
+        trust = (iterations[-1].validity * kept).sum(-1) / kept.sum(-1).clamp_min(1)
+        return Output(rotation, translation, iterations, source, target, trust.detach())
 
     def iterate(
-        self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor
+        self,
+        source: Tensor,
+        target: Tensor,
+        source_features: Tensor,
+        target_features: Tensor,
+        count: int | None = None,
     ) -> list[Iteration]:
         """Match key points (B, M, 3) to (B, L, 3), solve for the step, move the source, and again."""
         iterations: list[Iteration] = []
-        for n in range(self.config.iterations):
+        for n in range(self.config.iterations if count is None else count):
             block = min(n, self.config.blocks - 1)
             maximum, score = self.similarity[block](source, target, source_features, target_features)
             step = self._solve(source, target, score, self.validity[block](maximum))
@@ -189,6 +215,20 @@ class IDAM(nn.Module):
                 match = gather_points(target, correspondence)
             rotation, translation = weighted_procrustes(source, match, weight)
         return Iteration(source, score, match, correspondence, validity_logit, weight, rotation, translation)
+
+
+def better(first: Output, second: Output) -> Output:
+    """Both tries as one: for each pair the second, where the first is not trusted and the second is trusted more."""
+    take = (first.trust < TRUSTED) & (second.trust > first.trust)
+    keys = second if bool(take.any()) else first
+    return Output(
+        torch.where(take[:, None, None], second.rotation, first.rotation),
+        torch.where(take[:, None], second.translation, first.translation),
+        keys.iterations,
+        keys.source,
+        keys.target,
+        torch.where(take, second.trust, first.trust),
+    )
 
 
 def chain(iterations: list[Iteration]) -> tuple[Tensor, Tensor]:

@@ -42,7 +42,8 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-        model = IDAM(Config(**json.loads(metadata["config"])))
+        config = json.loads(metadata["config"])
+        model = IDAM(Config(**{**config, "keep_again": tuple(config.get("keep_again", ()))}))
         model.load_state_dict(state)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0][:120]

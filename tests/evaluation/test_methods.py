@@ -1,0 +1,104 @@
+"""The rows of the tables by name, and the rows of the network."""
+
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from idam.errors import InputError
+from idam.evaluation.methods import METHODS, build_method, network, pipeline
+from idam.network.model import IDAM, Config
+from idam.network.pretrained import save_model
+
+NETWORKS = {"gnn-idam": "gnn", "fpfh-idam": "fpfh"}
+
+
+@pytest.fixture
+def model(seasoned) -> IDAM:
+    return seasoned(IDAM(Config(neighbours=5, channels=8, keep=1 / 2)), torch.float32)
+
+
+@pytest.fixture
+def weights(tmp_path: Path, model: IDAM) -> str:
+    path = tmp_path / "small.safetensors"
+    save_model(path, model, {})
+    return str(path)
+
+
+@pytest.fixture
+def clouds() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return tuple(rng.standard_normal((count, 3)).astype(np.float32) for count in (40, 50))
+
+
+@pytest.mark.parametrize("name", ["gnn_idam", "", "GNN-IDAM", "sift"])
+def test_an_unknown_method_is_answered_with_the_known_ones(name):
+    with pytest.raises(InputError) as caught:
+        build_method(name)
+    assert repr(name) in str(caught.value)
+    assert ", ".join(METHODS) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("place", METHODS.values(), ids=METHODS)
+def test_every_name_leads_to_a_function(place):
+    module, function = place.split(":")
+    assert callable(getattr(import_module(module), function))
+
+
+def test_the_network_s_own_rows_and_the_whole_of_register_are_there():
+    assert {*NETWORKS, "register"} <= METHODS.keys()
+
+
+def test_the_network_s_row_is_its_output_as_one_matrix(model, weights, clouds):
+    found = build_method("gnn-idam", weights)(*clouds)
+    output = model(*(torch.from_numpy(cloud)[None] for cloud in clouds))
+    assert found.shape == (4, 4)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found[:3, :3], output.rotation[0].detach(), atol=1e-6)
+    np.testing.assert_allclose(found[:3, 3], output.translation[0].detach(), atol=1e-6)
+    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
+
+
+def test_the_weights_are_read_once_and_not_for_every_pair(weights, clouds):
+    method = build_method("gnn-idam", weights)
+    Path(weights).unlink()
+    np.testing.assert_array_equal(method(*clouds), method(*clouds))
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_without_a_model_the_network_has_the_weights_for_unseen_shapes(name, monkeypatch):
+    asked = []
+    monkeypatch.setattr(network, "load_model", asked.append)
+    build_method(name)
+    build_method(name, "another")
+    assert asked == [f"{NETWORKS[name]}-unseen-shapes", "another"]
+
+
+def test_clouds_too_small_for_the_network_are_refused(weights, clouds):
+    with pytest.raises(InputError, match="5 points"):
+        build_method("gnn-idam", weights)(clouds[0][:5], clouds[1])
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_an_unknown_model_is_refused_before_any_pair(name):
+    with pytest.raises(InputError, match="unknown model 'sift'"):
+        build_method(name, "sift")
+
+
+@pytest.mark.parametrize(("model", "expected"), [(None, "default"), ("another", "another")])
+def test_the_register_row_is_register_with_nothing_set_but_the_model(model, expected, clouds, monkeypatch):
+    calls, answer = [], np.diag([1.0, -1.0, -1.0, 1.0])
+
+    def register(*args: object, **options: object) -> SimpleNamespace:
+        calls.append((args, options))
+        return SimpleNamespace(transformation=answer)
+
+    monkeypatch.setattr(pipeline, "register", register)
+    assert build_method("register", model)(*clouds) is answer
+    ((args, options),) = calls
+    assert [a is b for a, b in zip(args, clouds, strict=True)] == [True, True]
+    assert options == {"model": expected}

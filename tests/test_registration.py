@@ -1,0 +1,476 @@
+"""``idam.register``, from any two clouds to one transform."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import astuple
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+import idam
+from idam import RegistrationResult
+from idam.errors import InputError
+from idam.io import PointCloud, write_point_cloud
+from idam.network.pretrained import find
+from idam.refine import METHODS
+
+UTM = np.array([5e5, 5.6e6, 100.0])
+SETTLED = 0.02
+"""Degrees, and hundredths of the cloud's size, within which refinement ends up in the same place."""
+
+
+def rigid(rotation: Rotation, translation: Any) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.as_matrix()
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> float:
+    """The angle between the rotations of two transforms."""
+    return float(np.degrees(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude()))
+
+
+def bracket(count: int, seed: int) -> np.ndarray:
+    """Points on a part without symmetry, about one unit long."""
+    corners = [
+        ([0, 0, 0], [1, 0.5, 0.12]),
+        ([0, 0, 0.12], [0.15, 0.5, 0.82]),
+        ([0.55, 0.1, 0.12], [0.8, 0.3, 0.47]),
+        ([0.8, 0.35, 0.12], [0.9, 0.45, 0.27]),
+    ]
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in corners])
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+
+
+TRUTH = rigid(Rotation.from_rotvec([1.0, -1.5, 0.8]), [1.0, 2.0, 3.0])
+SOURCE = bracket(400, seed=1)
+TARGET = move(TRUTH, bracket(450, seed=2))
+CENTRE = SOURCE.mean(0)
+
+
+def assert_right(result: RegistrationResult, truth: np.ndarray, centre: np.ndarray, size: float = 1.0) -> None:
+    assert degrees(result.transformation, truth) < 5.0
+    assert np.linalg.norm(result.apply(centre) - move(truth, centre)) < 0.03 * size
+
+
+def assert_settled(transformation: np.ndarray, expected: np.ndarray, centre: np.ndarray, size: float = 1.0) -> None:
+    assert degrees(transformation, expected) < SETTLED
+    assert np.linalg.norm(move(transformation, centre) - move(expected, centre)) < SETTLED / 100 * size
+
+
+def refusal(*data: Any, **options: Any) -> str:
+    with pytest.raises(InputError) as error:
+        idam.register(*(data or (SOURCE, TARGET)), **options)
+    assert isinstance(error.value, ValueError)
+    message = str(error.value)
+    assert message
+    assert "\n" not in message
+    return message
+
+
+@pytest.fixture(scope="session")
+def result() -> RegistrationResult:
+    """The easy pair, with no option given."""
+    return idam.register(SOURCE, TARGET)
+
+
+# --- the answer ----------------------------------------------------------------------------------------------------
+
+
+def test_easy_pair(result: RegistrationResult) -> None:
+    assert_right(result, TRUTH, CENTRE)
+
+
+def test_transformation_is_rigid_in_double_precision(result: RegistrationResult) -> None:
+    rotation = result.transformation[:3, :3]
+    assert result.transformation.shape == (4, 4)
+    assert result.transformation.dtype == np.float64
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) > 0
+    np.testing.assert_array_equal(result.transformation[3], [0, 0, 0, 1])
+
+
+def test_figures_are_those_of_brute_force(result: RegistrationResult) -> None:
+    pairs = result.correspondence_set
+    assert pairs.ndim == 2
+    assert pairs.shape[1] == 2
+    assert pairs.dtype.kind == "i"
+    distance = cdist(result.apply(SOURCE), TARGET)
+    rows = np.flatnonzero(distance.min(1) < result.max_correspondence_distance)
+    assert 0 < len(rows) < len(SOURCE)
+    np.testing.assert_array_equal(pairs, np.stack([rows, distance.argmin(1)[rows]], 1))
+    assert result.fitness == len(rows) / len(SOURCE)
+    assert result.inlier_rmse == pytest.approx(np.sqrt(np.mean(distance.min(1)[rows] ** 2)))
+
+
+def test_other_fields(result: RegistrationResult) -> None:
+    assert 0.0 <= result.confidence <= 1.0
+    assert all(0.0 <= evidence <= 1.0 for evidence in astuple(result.evidence))
+    assert result.model in idam.list_models()
+    assert 0.0 < result.seconds < 60.0
+    assert result.information.shape == (6, 6)
+    assert np.linalg.eigvalsh(result.information).min() > 0
+
+
+def test_matches_are_in_the_input_coordinates(result: RegistrationResult) -> None:
+    matches = result.matches
+    assert matches.source.shape == matches.target.shape == (*matches.weight.shape, 3)
+    assert matches.weight.sum() == pytest.approx(1.0)
+    # 400 points go to the network as they are
+    assert cdist(matches.source, SOURCE).min(1).max() < 1e-5
+    together = np.linalg.norm(result.apply(matches.source) - matches.target, axis=1) < 0.2
+    assert matches.weight[together].sum() > 0.3
+
+
+def test_max_correspondence_distance_is_what_is_measured_at() -> None:
+    near, far = (idam.register(SOURCE, TARGET, max_correspondence_distance=np.float32(d)) for d in (0.01, 0.5))
+    assert near.max_correspondence_distance == pytest.approx(0.01)
+    assert near.inlier_rmse < 0.01
+    assert near.fitness < far.fitness == 1.0
+    np.testing.assert_array_equal(near.transformation, far.transformation)
+    assert all(isinstance(figure, float) for figure in (far.max_correspondence_distance, far.fitness, far.inlier_rmse))
+
+
+def test_same_seed_same_bits(result: RegistrationResult) -> None:
+    torch.rand(3)
+    state = torch.get_rng_state()
+    again = idam.register(SOURCE, TARGET)
+    np.testing.assert_array_equal(again.transformation, result.transformation)
+    np.testing.assert_array_equal(again.information, result.information)
+    assert again.confidence == result.confidence
+    assert (torch.get_rng_state() == state).all()
+
+
+@pytest.mark.parametrize("seed", [7, -1, np.int64(7)])
+def test_any_seed_finds_the_easy_pair(result: RegistrationResult, seed: Any) -> None:
+    other = idam.register(SOURCE, TARGET, seed=seed)
+    assert_settled(other.transformation, result.transformation, CENTRE)
+    assert (other.matches.source != result.matches.source).any()
+
+
+def test_clouds_are_left_as_they_were() -> None:
+    source, target = SOURCE.copy(), TARGET.copy()
+    source.setflags(write=False)
+    idam.register(source, target)
+    np.testing.assert_array_equal(target, TARGET)
+
+
+# --- what it takes -------------------------------------------------------------------------------------------------
+
+
+def as_trimesh(points: np.ndarray) -> Any:
+    return trimesh.PointCloud(points)
+
+
+def as_open3d(points: np.ndarray) -> Any:
+    try:
+        import open3d
+    except (ImportError, OSError) as error:  # its wheel counts on system libraries
+        pytest.skip(f"Open3D cannot be imported ({error})")
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+
+
+@pytest.mark.parametrize(
+    "kind", [torch.tensor, np.ndarray.tolist, PointCloud, np.asfortranarray, as_trimesh, as_open3d]
+)
+def test_takes(kind: Callable[[np.ndarray], Any], result: RegistrationResult) -> None:
+    found = idam.register(kind(SOURCE), kind(TARGET))
+    assert_settled(found.transformation, result.transformation, CENTRE)
+    np.testing.assert_array_equal(found.correspondence_set, result.correspondence_set)
+
+
+def test_takes_paths_of_single_precision(result: RegistrationResult, tmp_path: Path) -> None:
+    write_point_cloud(tmp_path / "source.ply", SOURCE)
+    found = idam.register(tmp_path / "source.ply", torch.tensor(TARGET, dtype=torch.float32, requires_grad=True))
+    assert_settled(found.transformation, result.transformation, CENTRE)
+    found = idam.register(str(tmp_path / "source.ply"), TARGET)
+    assert_settled(found.transformation, result.transformation, CENTRE)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 0.3048, 1000.0])
+def test_unit_does_not_matter(result: RegistrationResult, unit: float) -> None:
+    found = idam.register(unit * SOURCE, unit * TARGET)
+    in_our_unit = found.transformation.copy()
+    in_our_unit[:3, 3] /= unit
+    assert_settled(in_our_unit, result.transformation, CENTRE)
+    assert found.max_correspondence_distance == pytest.approx(unit * result.max_correspondence_distance)
+    assert found.fitness == pytest.approx(result.fitness, abs=0.01)
+    assert found.inlier_rmse == pytest.approx(unit * result.inlier_rmse, rel=0.02)
+    assert found.confidence == pytest.approx(result.confidence, abs=0.05)
+
+
+@pytest.mark.parametrize(("source_at", "target_at"), [(UTM, UTM), (UTM, 0 * UTM), (-UTM, UTM[::-1])])
+def test_place_does_not_matter(result: RegistrationResult, source_at: np.ndarray, target_at: np.ndarray) -> None:
+    found = idam.register(SOURCE + source_at, TARGET + target_at)
+    assert degrees(found.transformation, result.transformation) < SETTLED
+    shift = found.apply(SOURCE + source_at) - (result.apply(SOURCE) + target_at)
+    assert np.abs(shift).max() < 1e-3
+    # millimetres in a national grid: the product of a rotation and 5.6e6 must not lose them
+    np.testing.assert_allclose(
+        found.transformation[:3, :3] @ found.transformation[:3, :3].T, np.eye(3), rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_turning_the_clouds_turns_the_answer(result: RegistrationResult, seed: int) -> None:
+    turns = [rigid(rotation, 0.0) for rotation in Rotation.random(2, rng=np.random.default_rng(seed))]
+    source, target = move(turns[0], SOURCE), move(turns[1], TARGET)
+    found = turns[1].T @ idam.register(source, target).transformation @ turns[0]
+    # the search starts elsewhere, but what the clouds say is the same
+    assert degrees(found, result.transformation) < 0.2
+    assert np.linalg.norm(move(found, CENTRE) - result.apply(CENTRE)) < 0.005
+
+
+def test_order_of_points_does_not_matter(result: RegistrationResult) -> None:
+    rows = np.random.default_rng(0).permutation(len(SOURCE))
+    found = idam.register(SOURCE[rows], TARGET[::-1])
+    assert_settled(found.transformation, result.transformation, CENTRE)
+    np.testing.assert_array_equal(np.sort(rows[found.correspondence_set[:, 0]]), result.correspondence_set[:, 0])
+
+
+def test_swapping_the_clouds_inverts_the_answer(result: RegistrationResult) -> None:
+    back = np.linalg.inv(idam.register(TARGET, SOURCE).transformation)
+    assert degrees(back, result.transformation) < 2.0
+    assert np.linalg.norm(move(back, CENTRE) - result.apply(CENTRE)) < 0.02
+
+
+# --- awkward clouds ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copies", [2, 20])
+def test_points_given_more_than_once(result: RegistrationResult, copies: int) -> None:
+    found = idam.register(np.repeat(SOURCE, copies, axis=0), np.repeat(TARGET, copies, axis=0))
+    assert_right(found, TRUTH, CENTRE)
+    assert found.fitness == pytest.approx(result.fitness, abs=0.05)
+    assert found.max_correspondence_distance == pytest.approx(result.max_correspondence_distance, rel=0.05)
+
+
+@pytest.mark.parametrize(("count", "distance"), [(400, 1e3), (400, 1e9), (3000, 1e7)])
+def test_a_stray_point_does_no_harm(count: int, distance: float, capfd: pytest.CaptureFixture[str]) -> None:
+    source = np.vstack([bracket(count, seed=1), [[distance, 0, 0]]])
+    found = idam.register(source, move(TRUTH, bracket(count, seed=2)))
+    assert_right(found, TRUTH, CENTRE)
+    assert np.isfinite(found.inlier_rmse)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_smallest_clouds() -> None:
+    found = idam.register(SOURCE[:20], move(TRUTH, SOURCE[:20]))
+    assert found.transformation.shape == (4, 4)
+    assert np.isfinite(found.transformation).all()
+
+
+def test_plane_on_plane() -> None:
+    plane = SOURCE * [1, 1, 0]
+    found = idam.register(plane, move(TRUTH, plane))
+    # which way it lies in the plane may be anybody's guess, but on the plane it lies
+    assert np.abs(move(np.linalg.inv(TRUTH), found.apply(plane))[:, 2]).max() < 0.05
+
+
+def test_source_too_small_beside_the_target() -> None:
+    message = refusal(0.01 * SOURCE, bracket(3000, seed=3))
+    assert message.startswith("source")
+    assert refusal(bracket(3000, seed=3), 0.01 * SOURCE).startswith("target")
+
+
+def test_few_places_many_points() -> None:
+    assert refusal(np.repeat(SOURCE[:5], 30, axis=0), TARGET).startswith("source")
+
+
+# --- options -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("refine", METHODS)
+def test_refinements(refine: str) -> None:
+    found = idam.register(SOURCE, TARGET, refine=refine)
+    assert_right(found, TRUTH, CENTRE)
+    assert found.information.any()
+
+
+def test_no_refinement(result: RegistrationResult) -> None:
+    with_none, with_word = (idam.register(SOURCE, TARGET, refine=refine) for refine in (None, "none"))
+    np.testing.assert_array_equal(with_none.transformation, with_word.transformation)
+    np.testing.assert_array_equal(with_none.information, np.zeros((6, 6)))
+    assert with_none.fitness <= result.fitness
+    assert (with_none.transformation != result.transformation).any()
+    rotation = with_none.transformation[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
+def test_model_by_name_and_by_file(result: RegistrationResult, tmp_path: Path) -> None:
+    copy = tmp_path / "mine.safetensors"
+    copy.write_bytes(find("default").read_bytes())
+    for model in (copy, str(copy), find("default").stem):
+        found = idam.register(SOURCE, TARGET, model=model)
+        np.testing.assert_array_equal(found.transformation, result.transformation)
+        assert found.model == Path(model).stem
+
+
+def test_init_is_tried_as_it_is() -> None:
+    # with nothing refined and the truth to try, the truth is the best there is
+    found = idam.register(SOURCE, TARGET, refine="none", init=TRUTH)
+    np.testing.assert_allclose(found.transformation, TRUTH, atol=1e-9)
+
+
+def test_init_is_taken_as_the_rotation_nearest_to_it() -> None:
+    rounded = TRUTH.round(4)
+    found = idam.register(SOURCE, TARGET, refine=None, init=rounded).transformation
+    np.testing.assert_allclose(found, TRUTH, atol=1e-3)
+    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_init_may_be_far_off(result: RegistrationResult) -> None:
+    far = rigid(Rotation.from_rotvec([3.0, 0.0, 0.0]), [50.0, 0.0, -9.0])
+    for init in (far, far.tolist(), torch.tensor(far)):
+        found = idam.register(SOURCE, TARGET, init=init)
+        assert_settled(found.transformation, result.transformation, CENTRE)
+
+
+def test_init_of_clouds_far_from_the_origin() -> None:
+    there, back = rigid(Rotation.identity(), UTM), rigid(Rotation.identity(), -UTM)
+    found = idam.register(SOURCE + UTM, TARGET + UTM, refine=None, init=there @ TRUTH @ back)
+    np.testing.assert_allclose(found.apply(SOURCE + UTM), move(TRUTH, SOURCE) + UTM, rtol=0, atol=1e-6)
+
+
+def test_voxel_size_sets_what_the_network_sees() -> None:
+    source, target = bracket(2000, seed=1), move(TRUTH, bracket(2000, seed=2))
+    coarse, fine = (idam.register(1000 * source, 1000 * target, voxel_size=size) for size in (150.0, 60.0))
+    assert 20 / 6 <= len(coarse.matches.weight) < len(fine.matches.weight) < 2000 / 6
+    assert_right(fine, rigid(Rotation.from_matrix(TRUTH[:3, :3]), 1000 * TRUTH[:3, 3]), 1000 * CENTRE, 1000.0)
+
+
+def test_voxel_size_below_the_spacing_changes_nothing(
+    result: RegistrationResult, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for voxel_size in (1e-3, 1e-12):
+        found = idam.register(SOURCE, TARGET, voxel_size=voxel_size)
+        assert_settled(found.transformation, result.transformation, CENTRE)
+    assert capfd.readouterr() == ("", "")
+
+
+# --- what it refuses -----------------------------------------------------------------------------------------------
+
+
+NAN = np.where(SOURCE > 0.9, np.nan, SOURCE)
+
+
+@pytest.mark.parametrize(
+    ("cloud", "message"),
+    [
+        (SOURCE[:10], "has 10 points"),
+        (np.zeros((0, 3)), "has 0 points"),
+        (np.zeros((50, 3)), "equal"),
+        (np.full((50, 3), np.nan), "50 of 50 points are NaN"),
+        (NAN, "NaN or infinite"),
+        (SOURCE[:, :1] * [1.0, 2.0, 3.0] + UTM, "line"),
+        (SOURCE[:, :2], r"\(N, 3\), got shape \(400, 2\)"),
+        (SOURCE.T, "transpose"),
+        (SOURCE > 0, "real numbers"),
+        (SOURCE * 1j, "real numbers"),
+        ([], "shape"),
+        (None, "NoneType"),
+        (1e200 * SOURCE, "infinite"),
+    ],
+)
+def test_refuses_clouds_by_name(cloud: Any, message: str) -> None:
+    assert refusal(cloud, TARGET).startswith("source: ")
+    with pytest.raises(InputError, match=rf"^target: .*{message}"):
+        idam.register(SOURCE, cloud)
+
+
+def test_refuses_files_by_path(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.ply"
+    assert refusal(missing, TARGET).startswith(f"{missing}: no such file")
+    few = tmp_path / "few.xyz"
+    np.savetxt(few, SOURCE[:10])
+    assert refusal(SOURCE, str(few)).startswith(f"{few}: has 10 points")
+
+
+@pytest.mark.parametrize("value", [0, 0.0, -1.0, np.nan, np.inf, "wide"])
+@pytest.mark.parametrize("option", ["voxel_size", "max_correspondence_distance"])
+def test_refuses_sizes(option: str, value: Any) -> None:
+    assert option in refusal(**{option: value})
+
+
+def test_refuses_a_voxel_size_that_leaves_nothing() -> None:
+    message = refusal(1000 * SOURCE, 1000 * TARGET, voxel_size=3000.0)
+    assert re.search(r"voxel.size", message)
+    assert "smaller" in message
+    figures = [float(figure) for figure in re.findall(r"\d+\.\d+|\d{3,}", message)]
+    assert set(figures) <= {3000.0}  # in the caller's unit, if at all
+
+
+def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds() -> None:
+    assert "larger" in refusal(bracket(6000, seed=1), bracket(6000, seed=2), voxel_size=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("model", "nosuch", "gnn-unseen-shapes"),
+        ("model", "", "unknown model"),
+        ("model", "nosuch.safetensors", "nosuch.safetensors"),
+        ("refine", "magic", "gicp, plane, point or none"),
+        ("refine", ["gicp"], "gicp, plane, point or none"),
+        ("device", "abacus", "abacus"),
+        ("device", "cuda:99", "cuda:99"),
+        ("seed", 2**70, "seed"),
+        ("seed", 1.5, "seed"),
+        ("seed", "one", "seed"),
+    ],
+)
+def test_refuses_options(option: str, value: Any, message: str) -> None:
+    assert message in refusal(**{option: value})
+
+
+def test_refuses_a_file_that_is_no_model(tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(b"nothing of the kind")
+    assert str(path) in refusal(model=path)
+
+
+@pytest.mark.parametrize(
+    "init",
+    [
+        np.eye(3),
+        np.zeros((4, 4)),
+        np.diag([2.0, 2, 2, 1]),
+        np.diag([1.0, 1, -1, 1]),
+        np.full((4, 4), np.nan),
+        np.full((4, 4), np.inf),
+        rigid(Rotation.identity(), [np.inf, 0, 0]),
+        rigid(Rotation.identity(), [1, 2, 3]).T,
+        [[1, 2], [3]],
+        "identity",
+    ],
+)
+def test_refuses_what_is_not_rigid(init: Any) -> None:
+    assert refusal(init=init).startswith("init ")
+
+
+# --- the shipped scans ---------------------------------------------------------------------------------------------
+
+
+def test_shipped_scans() -> None:
+    with resources.as_file(resources.files("idam") / "data" / "demo") as folder:
+        source, target = folder / "source.ply", folder / "target.ply"
+        truth = np.loadtxt(folder / "truth.txt")
+        centre = trimesh.load(source).vertices.mean(0)
+        found = idam.register(source, target)
+    assert degrees(found.transformation, truth) < 5.0
+    assert np.linalg.norm(found.apply(centre) - move(truth, centre)) < 0.01
+    assert found.fitness > 0.5

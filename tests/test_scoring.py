@@ -1,0 +1,140 @@
+"""How well a transform explains two clouds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from idam.refine import Refinable
+from idam.scoring import Agreement, agreement, inliers
+
+DISTANCE = 0.1
+
+
+@dataclass
+class Surface:
+    """Points with normals of our own choice, in place of a Refinable."""
+
+    points: np.ndarray
+    normals: np.ndarray
+
+
+@pytest.fixture
+def random() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def sphere(random: np.random.Generator) -> Surface:
+    normals = random.normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Surface(normals * [1.0, 0.8, 0.6], normals)
+
+
+@pytest.fixture
+def transformation() -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec([0.5, -1.2, 0.7]).as_matrix()
+    matrix[:3, 3] = [0.3, -2.0, 1.0]
+    return matrix
+
+
+def moved(surface: Surface, transformation: np.ndarray) -> Surface:
+    rotation, translation = transformation[:3, :3], transformation[:3, 3]
+    return Surface(surface.points @ rotation.T + translation, surface.normals @ rotation.T)
+
+
+def part(surface: Surface, rows: slice) -> Surface:
+    return Surface(surface.points[rows], surface.normals[rows])
+
+
+def test_identical_clouds_agree_wholly(sphere: Surface, transformation: np.ndarray) -> None:
+    assert agreement(sphere, moved(sphere, transformation), transformation, DISTANCE) == Agreement(1.0, 1.0)
+    assert agreement(sphere, sphere, np.eye(4), DISTANCE).score == 1.0
+
+
+def test_disjoint_clouds_do_not_agree(sphere: Surface) -> None:
+    away = np.eye(4)
+    away[0, 3] = 5.0
+    assert agreement(sphere, sphere, away, DISTANCE) == Agreement(0.0, 0.0)
+    assert agreement(sphere, sphere, away, DISTANCE).score == 0.0
+
+
+def test_swapping_the_clouds_swaps_the_shares(
+    sphere: Surface, transformation: np.ndarray, random: np.random.Generator
+) -> None:
+    source = part(sphere, slice(0, 350))
+    target = moved(part(sphere, slice(200, 500)), transformation)
+    target = Surface(target.points + random.normal(scale=0.04, size=(300, 3)), target.normals)
+    there = agreement(source, target, transformation, DISTANCE)
+    back = agreement(target, source, np.linalg.inv(transformation), DISTANCE)
+    assert (there.source_share, there.target_share) == (back.target_share, back.source_share)
+    assert there.score == back.score
+    assert 0.3 < there.target_share < 0.9
+
+
+def test_shares_are_those_of_the_points_in_the_overlap(sphere: Surface) -> None:
+    found = agreement(part(sphere, slice(0, 400)), part(sphere, slice(300, 500)), np.eye(4), 1e-6)
+    assert found == Agreement(100 / 400, 100 / 200)
+    assert found.score == pytest.approx((0.25 * 0.5) ** 0.5)
+
+
+@pytest.mark.parametrize(("degrees", "same"), [(0, True), (40, True), (50, False), (90, False), (140, True)])
+def test_normals_count_up_to_their_sign(sphere: Surface, degrees: float, same: bool) -> None:
+    across = np.cross(sphere.normals, [0.6, 0.0, 0.8])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    turned = np.cos(np.radians(degrees)) * sphere.normals + np.sin(np.radians(degrees)) * across
+    other = Surface(sphere.points, turned)
+    # so close that each point finds itself
+    assert agreement(sphere, other, np.eye(4), 1e-6).score == float(same)
+
+
+def test_wrong_normals_take_from_the_score(sphere: Surface, random: np.random.Generator) -> None:
+    wrong = sphere.normals.copy()
+    wrong[:100] = np.cross(wrong[:100], random.normal(size=3))
+    wrong[:100] /= np.linalg.norm(wrong[:100], axis=1, keepdims=True)
+    assert agreement(sphere, Surface(sphere.points, wrong), np.eye(4), 1e-6) == Agreement(0.8, 0.8)
+
+
+def test_falls_as_the_clouds_part(sphere: Surface) -> None:
+    scores = []
+    for shift in (0.0, 0.065, 0.13, 0.3, 1.5):
+        away = np.eye(4)
+        away[:3, 3] = shift
+        scores.append(agreement(sphere, sphere, away, DISTANCE).score)
+    assert scores == sorted(scores, reverse=True)
+    assert len(set(scores)) == len(scores)
+
+
+def test_takes_the_normals_that_refinement_estimates(transformation: np.ndarray, random: np.random.Generator) -> None:
+    plane, other = (random.uniform(-1, 1, size=(800, 3)) * [1, 1, 0] for _ in range(2))
+    target = Refinable.build(other @ transformation[:3, :3].T + transformation[:3, 3])
+    assert agreement(Refinable.build(plane), target, transformation, 0.2).score > 0.98
+    upright = transformation.copy()
+    upright[:3, :3] = transformation[:3, :3] @ Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix()
+    assert agreement(Refinable.build(plane), target, upright, 0.2).score < 0.05
+
+
+# --- inliers -------------------------------------------------------------------------------------------------------
+
+
+def test_inliers_are_those_of_brute_force(random: np.random.Generator) -> None:
+    source, target = random.uniform(size=(80, 3)), random.uniform(size=(60, 3))
+    pairs, rmse = inliers(source, target, DISTANCE)
+    distance = cdist(source, target)
+    rows = np.flatnonzero(distance.min(1) < DISTANCE)
+    assert 5 < len(rows) < 75
+    assert pairs.dtype == np.int64
+    np.testing.assert_array_equal(pairs, np.stack([rows, distance.argmin(1)[rows]], 1))
+    assert rmse == pytest.approx(np.sqrt(np.mean(distance.min(1)[rows] ** 2)))
+
+
+def test_no_inliers(random: np.random.Generator) -> None:
+    pairs, rmse = inliers(random.uniform(size=(80, 3)), random.uniform(size=(60, 3)) + 9, DISTANCE)
+    assert pairs.shape == (0, 2)
+    assert pairs.dtype == np.int64
+    assert rmse == 0.0
