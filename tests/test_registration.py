@@ -19,9 +19,13 @@ from scipy.spatial.transform import Rotation
 import idam
 from idam import RegistrationResult
 from idam.errors import InputError
+from idam.hypotheses import Hypothesis
 from idam.io import PointCloud, write_point_cloud
 from idam.network.pretrained import find
+from idam.ranking import Answer
 from idam.refine import METHODS
+from idam.registration import Level, finish
+from idam.result import Matches
 
 UTM = np.array([5e5, 5.6e6, 100.0])
 SETTLED = 0.02
@@ -299,6 +303,20 @@ def test_refinements(refine: str) -> None:
     found = idam.register(SOURCE, TARGET, refine=refine)
     assert_right(found, TRUTH, CENTRE)
     assert found.information.any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_last_refinement_takes_the_fine_clouds(method: str) -> None:
+    fine = Level(SOURCE - CENTRE, bracket(2000, seed=2) - CENTRE, spacing=0.05)
+    start = rigid(Rotation.from_rotvec([0.04, -0.03, 0.02]), [0.01, 0.0, -0.02])
+    answer = Answer(start, Hypothesis(start, Matches(*np.empty((3, 0))), 0.0))
+    found, information = finish(answer, fine, method)
+    assert degrees(found, np.eye(4)) < 0.5 < degrees(start, np.eye(4))
+    assert np.linalg.norm(found[:3, 3]) < 0.005
+    assert np.linalg.eigvalsh(information).min() > 0
+    untouched, nothing = finish(answer, fine, "none")
+    np.testing.assert_array_equal(untouched, start)
+    assert not nothing.any()
 
 
 def test_no_refinement(result: RegistrationResult) -> None:

@@ -18,7 +18,7 @@ from idam.errors import InputError
 from idam.hypotheses import propose, starting_rotations
 from idam.io import as_point_cloud
 from idam.network.model import IDAM
-from idam.network.pretrained import find, load_model
+from idam.network.pretrained import DEFAULT, find, load_model
 from idam.preprocess import MIN_POINTS, Frame, check_points, choose_voxel_size, common_frame, downsample
 from idam.ranking import Answer, Surfaces, distinct, improve
 from idam.refine import METHODS, Refinable
@@ -38,6 +38,8 @@ FINE_POINTS = 30_000
 """Points of the larger cloud that the last refinement uses."""
 STARTS = 24
 """Rotations of the source that the network starts from."""
+PROPOSERS = (DEFAULT, "fpfh-unseen-shapes")
+"""The default's networks: learned features see more of a scan, FPFH does not mind how it is turned."""
 CONTENDERS = 4
 """Answers that stay in the race on the dense clouds."""
 
@@ -59,7 +61,8 @@ def register(
     Args:
         source: a path, an (N, 3) array or tensor, or an Open3D or trimesh cloud; in any unit, of any size.
         target: likewise, in the same unit.
-        model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them.
+        model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them; ``default``
+            takes the proposals of two networks, on GNN and on FPFH features.
         init: (4, 4), a guess of the transform: an answer to consider, and where the network's starts turn around.
         voxel_size: of the clouds the network sees, in the input's units; None takes it from the data.
         max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for the spacing
@@ -79,14 +82,14 @@ def register(
     started = time.perf_counter()
     check_options(voxel_size, max_correspondence_distance, refine)
     source_points, target_points = (as_points(data, name) for data, name in ((source, "source"), (target, "target")))
-    network = cached_model(os.fspath(model), device)
+    networks = [cached_model(name, device) for name in (PROPOSERS if model == "default" else (os.fspath(model),))]
     frame = common_frame(source_points, target_points)
     small, dense, fine = pyramid(
         frame.source(source_points), frame.target(target_points), voxel_size and voxel_size / frame.scale
     )
     guess = np.eye(4) if init is None else frame.enter(as_rigid(init))
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
-    hypotheses = propose(network, small.source, small.target, starts)
+    hypotheses = [h for network in networks for h in propose(network, small.source, small.target, starts)]
     method = refine or "none"
     answers = [Answer(hypothesis.transformation, hypothesis) for hypothesis in hypotheses]
     if init is not None:
@@ -109,7 +112,7 @@ def register(
         max_correspondence_distance=distance,
         information=information,
         matches=in_input_units(answers[0].hypothesis.matches, frame),
-        model=find(model).stem,
+        model=model if model == "default" else find(model).stem,
         seconds=time.perf_counter() - started,
     )
 
@@ -208,7 +211,7 @@ def gather_evidence(answers: list[Answer], spacing: float) -> Evidence:
         overlap=best.overlap,
         margin=best.overlap - (answers[1].overlap if len(answers) > 1 else 0.0),
         support=float(matches.weight[together].sum()),
-        votes=best.votes / STARTS,
+        votes=best.votes / sum(answer.votes for answer in answers),
     )
 
 
