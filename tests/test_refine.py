@@ -101,7 +101,7 @@ def test_without_overlap_the_start_stays(pair: Pair, method: str) -> None:
 
 def test_a_touch_of_a_few_points_is_no_overlap(pair: Pair) -> None:
     source = pair[0].points
-    elsewhere = np.vstack([source[::700] + [0.01, 0.02, -0.01], source + 50.0])
+    elsewhere = np.vstack([np.add(source[::700], (0.01, 0.02, -0.01)), source + 50.0])
     assert len(elsewhere) - len(source) < 10
     found, information = refine(pair[0], Refinable.build(elsewhere), np.eye(4), DISTANCE)
     np.testing.assert_array_equal(found, np.eye(4))

@@ -145,30 +145,20 @@ def show(result: RegistrationResult) -> None:
 @app.command()
 def models() -> None:
     """List the shipped models: what they were trained on and how they did."""
-    from rich.console import Console
-    from rich.table import Table
-
     from idam.network.pretrained import list_models, provenance
 
-    table = Table("model", "features", "experiment", "iterations", "steps", "seed", "RMSE(R)", "MAE(R)", "commit")
-    for name in list_models():
+    for name in list_models():  # no table: names and commands are to be copied, whatever the terminal's width
         history = provenance(name)
-        scores = history.get("validation", {})
-        table.add_row(
-            name,
-            history["config"]["features"],
-            history.get("experiment", ""),
-            str(history["config"]["iterations"]),
-            str(history.get("steps", "")),
-            str(history.get("recipe", {}).get("seed", "")),
-            f"{scores.get('rmse_r', float('nan')):.3f}",
-            f"{scores.get('mae_r', float('nan')):.3f}",
-            history.get("commit", ""),
+        config, scores = history["config"], history.get("validation", {})
+        print(name)
+        print(
+            f"  {config['features']} features, {history.get('experiment', '')}, {config['iterations']} iterations, "
+            f"{history.get('steps', '')} steps, seed {history.get('recipe', {}).get('seed', '')}, "
+            f"commit {history.get('commit') or 'unknown'}"
         )
-        table.add_row("", "", f"[dim]{history.get('command', '')}[/dim]", end_section=True)
-    console = Console()
-    console.print(table)
-    console.print("Errors in degrees, network alone, on shapes held out of the training split.")
+        print(f"  RMSE(R) {scores.get('rmse_r', float('nan')):.3f}, MAE(R) {scores.get('mae_r', float('nan')):.3f}")
+        print(f"  {history.get('command', '')}")
+    print("Errors in degrees, network alone, on shapes held out of the training split.")
 
 
 @app.command()
@@ -238,7 +228,7 @@ def evaluate(
     pairs: Annotated[Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="Rows to compute; all if left out.")] = None,
     model: Annotated[str | None, typer.Option(help="Weights for the idam rows.")] = None,
-    limit: Annotated[int | None, typer.Option(help="Only so many pairs, for a quick look.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only so many pairs, for a quick look.")] = None,
     json: Json = None,
 ) -> None:
     """Measure methods on the pairs of an experiment, or on your own.
@@ -310,7 +300,8 @@ def progress_bar(total: int) -> Any:
 
     @contextmanager
     def bar() -> Any:
-        with Progress(console=Console(stderr=True), transient=True) as progress:
+        console = Console(stderr=True)
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
             task = progress.add_task("registering", total=total)
             yield lambda: progress.advance(task)
 

@@ -9,6 +9,7 @@ import subprocess
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from idam.data.pairs import EXPERIMENTS, Pairs, experiment_noise, fixed_pairs, m
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform, gather_points
+from idam.io.files import one_line
 from idam.memory import keep_freed_memory
 from idam.network.elimination import keep_most_significant
 from idam.network.model import IDAM, Config, KeyPoints
@@ -156,7 +158,7 @@ def split_validation(shapes: Shapes, seed: int, noise: float) -> tuple[Shapes, P
 
 def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -> Batch:
     """The pairs and sampled points of one process at one step, a function of the seed and the step alone."""
-    per_epoch = max(1, len(shapes) // recipe.batch_size)
+    per_epoch = len(shapes) // recipe.batch_size
     epoch, position = divmod(step, per_epoch)
     order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
     rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
@@ -209,9 +211,13 @@ def train(
     """
     try:
         from lightning_fabric import Fabric
+        from torch.utils.tensorboard import SummaryWriter  # noqa: F401 - for the log
     except ImportError as error:
-        raise MissingDependencyError("training needs Lightning Fabric: pip install 'idam[train]'") from error
+        raise MissingDependencyError(
+            "training needs Lightning Fabric and TensorBoard: pip install 'idam[train]'"
+        ) from error
     check(recipe)
+    check_run(device, precision, validate_every)
     output = prepare_folder(Path(output))
     keep_freed_memory()
     fabric = Fabric(
@@ -224,7 +230,8 @@ def train(
     shapes, validation = split_validation(
         experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.noise
     )
-    total = max(1, round(recipe.epochs * max(1, len(shapes) // recipe.batch_size)))
+    check_batch(recipe.batch_size, len(shapes), fabric.world_size)
+    total = max(1, round(recipe.epochs * (len(shapes) // recipe.batch_size)))
     module = SupervisedStep(initial_model(recipe), recipe, precision)
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     progress = restore(output / "last.ckpt", module, optimizer, recipe) if resume else Progress()
@@ -241,6 +248,7 @@ def train(
             step_optimizer.zero_grad()
             log.step(step, loss)
             if (step + 1) % validate_every == 0 or step + 1 == total:
+                check_finite(module, step)
                 progress.step, progress.seconds = step + 1, time.monotonic() - started
                 if fabric.is_global_zero:
                     scores = validate(module.model, validation)
@@ -248,7 +256,9 @@ def train(
                     if scores.mae_r < progress.best:
                         progress.best = scores.mae_r
                         save_model(
-                            output / "best.safetensors", module.model, history(recipe, progress, scores, command)
+                            output / "best.safetensors",
+                            module.model,
+                            history(recipe, progress, scores, len(validation), command),
                         )
                     save_checkpoint(output / "last.ckpt", module, optimizer, progress, recipe)
                 fabric.barrier()
@@ -261,8 +271,43 @@ def check(recipe: Recipe) -> None:
         raise InputError(f"unknown experiment {recipe.experiment!r}: choose {', '.join(EXPERIMENTS)}")
     if recipe.schedule not in ("step", "one-cycle"):
         raise InputError(f"unknown schedule {recipe.schedule!r}: choose step or one-cycle")
-    if recipe.epochs <= 0 or recipe.batch_size < 2 or recipe.learning_rate <= 0:
-        raise InputError("epochs and the learning rate must be positive, and the batch at least 2 pairs")
+    if recipe.config.features not in ("gnn", "fpfh"):
+        raise InputError(f"unknown features {recipe.config.features!r}: choose gnn or fpfh")
+    positive = (recipe.epochs, recipe.learning_rate, recipe.radius)
+    if not all(0 < value < math.inf for value in positive) or recipe.batch_size < 2:
+        raise InputError("epochs, the learning rate and the radius must be positive, and the batch at least 2 pairs")
+    if not 0 < recipe.keep <= 1:
+        raise InputError(f"cannot sample a share of {recipe.keep:g} of the points: choose one in (0, 1]")
+    if abs(recipe.seed) >= 2**31:
+        raise InputError(f"the seed {recipe.seed} is too large: choose one of 32 bits")
+
+
+def check_run(device: str, precision: str, validate_every: int) -> None:
+    """Raise InputError where a recipe cannot be run this way here."""
+    if device not in ("auto", "cpu", "cuda"):
+        raise InputError(f"unknown device {device!r}: choose auto, cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("there is no CUDA device here: choose another --device")
+    if precision not in ("32", "bf16"):
+        raise InputError(f"unknown precision {precision!r}: choose 32 or bf16")
+    if validate_every < 1:
+        raise InputError(f"cannot validate every {validate_every} steps: choose 1 or more")
+
+
+def check_batch(batch_size: int, shapes: int, processes: int) -> None:
+    """Raise InputError where there are too few shapes for a batch, or too few pairs in one for all processes."""
+    if batch_size > shapes:
+        raise InputError(
+            f"{shapes} shapes to train on do not fill a batch of {batch_size}: choose a smaller --batch-size"
+        )
+    if batch_size < processes:
+        raise InputError(f"{processes} processes cannot share a batch of {batch_size}: choose a larger --batch-size")
+
+
+def check_finite(module: SupervisedStep, step: int) -> None:
+    """Raise InputError where the training has diverged: weights that are no numbers answer identity, which scores."""
+    if not all(parameter.isfinite().all() for parameter in module.parameters()):
+        raise InputError(f"the training has diverged by step {step + 1}: choose a smaller --learning-rate")
 
 
 def initial_model(recipe: Recipe) -> IDAM:
@@ -289,7 +334,7 @@ def prepare_folder(folder: Path) -> Path:
     return folder
 
 
-def history(recipe: Recipe, progress: Progress, scores: Metrics, command: str) -> dict[str, Any]:
+def history(recipe: Recipe, progress: Progress, scores: Metrics, pairs: int, command: str) -> dict[str, Any]:
     """The provenance of a model: what it was trained on, how far, and how it did on the validation pairs."""
     return {
         "experiment": recipe.experiment,
@@ -298,7 +343,7 @@ def history(recipe: Recipe, progress: Progress, scores: Metrics, command: str) -
         "steps": progress.step,
         "training_seconds": round(progress.seconds),
         "validation": {key: round(value, 5) for key, value in scores.to_dict().items()},
-        "validation_pairs": f"{VALIDATION_SHAPES} shapes held out of the training split",
+        "validation_pairs": f"{pairs} shapes held out of the training split",
         "command": command,
         "commit": commit(),
         "torch": torch.__version__,
@@ -306,14 +351,17 @@ def history(recipe: Recipe, progress: Progress, scores: Metrics, command: str) -
 
 
 def commit() -> str:
-    """The source's commit, or an empty string outside a checkout."""
+    """The source's commit, or an empty string outside its own checkout."""
+    folder = Path(__file__).parent
     try:
+        # a package installed below someone else's checkout is not in its tree
+        listed = subprocess.run(
+            ["git", "ls-files", "--error-unmatch", Path(__file__).name], cwd=folder, capture_output=True, check=False
+        )
+        if listed.returncode != 0:
+            return ""
         result = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=False,
+            ["git", "rev-parse", "--short", "HEAD"], cwd=folder, capture_output=True, text=True, check=False
         )
     except OSError:
         return ""
@@ -331,20 +379,32 @@ def save_checkpoint(
         "recipe": json.dumps(asdict(recipe)),
     }
     partial = path.with_suffix(".tmp")
-    torch.save(state, partial)
-    partial.replace(path)
+    try:
+        torch.save(state, partial)
+        partial.replace(path)
+    except (OSError, RuntimeError) as error:  # torch turns some of the system's errors into its own
+        raise InputError(
+            f"{path}: cannot be written ({one_line(error)}); make room or choose another --output"
+        ) from None
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def restore(path: Path, module: SupervisedStep, optimizer: torch.optim.Optimizer, recipe: Recipe) -> Progress:
     """Load a checkpoint, if there is one; raise InputError where it is another recipe's."""
     if not path.is_file():
         return Progress()
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    if json.loads(state["recipe"]) != json.loads(json.dumps(asdict(recipe))):
-        raise InputError(f"{path}: was trained with other options; give the same ones, or another --output")
-    module.model.load_state_dict(state["model"])
-    optimizer.load_state_dict(state["optimizer"])
-    return Progress(**state["progress"])
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if json.loads(state["recipe"]) == json.loads(json.dumps(asdict(recipe))):
+            module.model.load_state_dict(state["model"])
+            optimizer.load_state_dict(state["optimizer"])
+            return Progress(**state["progress"])
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, EOFError, UnpicklingError) as error:
+        raise InputError(
+            f"{path}: not a checkpoint of idam ({one_line(error)}); start again without --resume"
+        ) from None
+    raise InputError(f"{path}: was trained with other options; give the same ones, or another --output")
 
 
 class Log:

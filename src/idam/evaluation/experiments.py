@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from idam.data.modelnet40 import experiment_shapes
-from idam.data.pairs import Pairs, experiment_noise, fixed_pairs
+from idam.data.pairs import EXPERIMENTS, Pairs, experiment_noise, fixed_pairs
 from idam.errors import InputError
 from idam.evaluation.methods import Method
 from idam.evaluation.metrics import Metrics, measure
@@ -57,8 +57,10 @@ def test_pairs(experiment: str, folder: str | Path) -> Pairs:
     """The test pairs of an experiment, the same on every machine.
 
     Raises:
-        InputError: the folder does not hold ModelNet40.
+        InputError: there is no such experiment, or the folder does not hold ModelNet40.
     """
+    if experiment not in EXPERIMENTS:
+        raise InputError(f"unknown experiment {experiment!r}: choose {', '.join(EXPERIMENTS)}")
     shapes = experiment_shapes(experiment, folder, "test")
     return fixed_pairs(shapes.points, TEST_SEED, experiment_noise(experiment))
 
@@ -73,11 +75,12 @@ def read_pairs(path: str | Path) -> Pairs:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an .npz of pairs")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy does not close a file that it opened and found to be broken
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file, np.errstate(over="ignore"):
             arrays = [np.asarray(file[key], np.float32) for key in ("source", "target", "R", "t")]
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]}; it needs the arrays source, target, R and t") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read as .npz ({error})") from None
     source, target, rotation, translation = arrays
     count = len(source) if source.ndim == 3 else -1
@@ -90,6 +93,10 @@ def read_pairs(path: str | Path) -> Pairs:
             )
         if not np.isfinite(array).all():
             raise InputError(f"{path}: {name} holds NaN or infinite numbers")
+    if min(source.shape[1], target.shape[1]) < 3:
+        raise InputError(f"{path}: a pair needs 3 points of each cloud or more; give larger clouds")
+    if np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation).min() < 0:
+        raise InputError(f"{path}: R holds matrices that are no rotations; needed are orthogonal ones, determinant 1")
     return Pairs(*(torch.from_numpy(array) for array in (source, target, rotation, translation)))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from idam.errors import InputError
 from idam.evaluation.methods import Method
 from idam.network.pretrained import load_model
 
@@ -27,7 +28,10 @@ def _alone(model: str) -> Method:
 
     @torch.inference_mode()
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
-        output = network(torch.from_numpy(source)[None], torch.from_numpy(target)[None])
+        try:
+            output = network(torch.from_numpy(source)[None], torch.from_numpy(target)[None])
+        except ValueError as error:  # clouds with too few points for the features
+            raise InputError(str(error)) from None
         transformation = np.eye(4)
         transformation[:3, :3] = output.rotation[0].numpy()
         transformation[:3, 3] = output.translation[0].numpy()
