@@ -100,10 +100,11 @@ def test_without_overlap_the_start_stays(pair: Pair, method: str) -> None:
 
 
 def test_a_touch_of_a_few_points_is_no_overlap(pair: Pair) -> None:
-    source = pair[0].points
-    elsewhere = np.vstack([np.add(source[::700], (0.01, 0.02, -0.01)), source + 50.0])
-    assert len(elsewhere) - len(source) < 10
-    found, information = refine(pair[0], Refinable.build(elsewhere), np.eye(4), DISTANCE)
+    target = pair[1].points
+    few = target[::700] + np.array([0.01, 0.02, -0.01])
+    assert 3 < len(few) < 10
+    source = Refinable.build(np.vstack([few, target + 50.0]))
+    found, information = refine(source, pair[1], np.eye(4), DISTANCE)
     np.testing.assert_array_equal(found, np.eye(4))
     assert not information.any()
 

@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 import idam
-from idam import RegistrationResult
+from idam import RegistrationResult, registration
 from idam.errors import InputError
 from idam.hypotheses import Hypothesis
 from idam.io import PointCloud, write_point_cloud
@@ -311,8 +311,8 @@ def test_last_refinement_takes_the_fine_clouds(method: str) -> None:
     start = rigid(Rotation.from_rotvec([0.04, -0.03, 0.02]), [0.01, 0.0, -0.02])
     answer = Answer(start, Hypothesis(start, Matches(*np.empty((3, 0))), 0.0))
     found, information = finish(answer, fine, method)
-    assert degrees(found, np.eye(4)) < 0.5 < degrees(start, np.eye(4))
-    assert np.linalg.norm(found[:3, 3]) < 0.005
+    assert degrees(found, np.eye(4)) < 1.5 < degrees(start, np.eye(4))
+    assert np.linalg.norm(found[:3, 3]) < 0.01
     assert np.linalg.eigvalsh(information).min() > 0
     untouched, nothing = finish(answer, fine, "none")
     np.testing.assert_array_equal(untouched, start)
@@ -432,7 +432,8 @@ def test_refuses_a_voxel_size_that_leaves_nothing() -> None:
     assert set(figures) <= {3000.0}  # in the caller's unit, if at all
 
 
-def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds() -> None:
+def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registration, "propose", lambda *_: pytest.fail("the network was given all of them"))
     assert "larger" in refusal(bracket(6000, seed=1), bracket(6000, seed=2), voxel_size=1e-4)
 
 

@@ -65,10 +65,11 @@ def check_points(points: Points, name: str) -> None:
     if not finite.all():
         count = int((~finite).sum())
         raise InputError(f"{name}: {count} of {len(points)} points are NaN or infinite; remove them first")
-    centred = points - points.mean(0)
+    core = _core(points)
+    centred = core - core.mean(0)
     largest = np.abs(centred).max()
     # below the rounding of the coordinates themselves, differences mean nothing
-    if largest <= 1e-12 * max(1.0, float(np.abs(points).max())):
+    if largest <= 1e-12 * max(1.0, float(np.abs(core).max())):
         raise InputError(f"{name}: all points are equal; nothing to register")
     spread = np.sqrt(np.clip(np.linalg.eigvalsh((centred / largest).T @ (centred / largest)), 0, None))
     if spread[1] <= FLATNESS * spread[2]:
@@ -76,16 +77,21 @@ def check_points(points: Points, name: str) -> None:
 
 
 def common_frame(source: Points, target: Points) -> Frame:
-    """Centre each cloud on its mean, in float64, and scale both so that the larger just fits the unit sphere.
+    """Centre each cloud on the mean of its core, in float64, and scale both so that the larger fits the unit sphere.
 
-    The radius is the 98th percentile of the distances, so that a few stray points do not shrink everything else.
+    The core leaves out the 2 % of points farthest from the median: a scanner's (0, 0, 0) for "no return", or a few
+    stray points, must not shrink everything else.
     """
-    centres = source.mean(0), target.mean(0)
-    radii = [
-        float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.98))
-        for points, centre in zip((source, target), centres, strict=True)
-    ]
-    return Frame(*centres, scale=max(radii) or 1.0)
+    cores = _core(source), _core(target)
+    centres = cores[0].mean(0), cores[1].mean(0)
+    radii = [np.linalg.norm(core - centre, axis=1).max() for core, centre in zip(cores, centres, strict=True)]
+    return Frame(centres[0], centres[1], scale=float(max(radii)) or 1.0)
+
+
+def _core(points: Points) -> Points:
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    near: NDArray[np.bool_] = distance <= np.quantile(distance, 0.98)
+    return points[near]
 
 
 def downsample(points: Points, voxel_size: float) -> Points:

@@ -42,10 +42,9 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-        config = json.loads(metadata["config"])
-        model = IDAM(Config(**{**config, "keep_again": tuple(config.get("keep_again", ()))}))
+        model = IDAM(Config(**_config(metadata)))
         model.load_state_dict(state)
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         reason = str(error).splitlines()[0][:120]
         raise InputError(f"{path}: not a model that idam wrote ({reason}); use one of {_names()}") from None
     return model.eval().requires_grad_(False).to(device or "cpu")
@@ -57,8 +56,8 @@ def provenance(name: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
-        return {"config": json.loads(metadata["config"]), **json.loads(metadata.get("provenance", "{}"))}
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        return {"config": _config(metadata), **json.loads(metadata.get("provenance", "{}"))}
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: not a model that idam wrote ({error})") from None
 
 
@@ -97,6 +96,11 @@ def find(name: str | os.PathLike[str]) -> Path:
             f"unknown model {os.fspath(name)!r}: use one of {_names()}, or the path of a .safetensors file"
         )
     return path
+
+
+def _config(metadata: dict[str, str]) -> dict[str, Any]:
+    """Arguments of :class:`Config`; JSON knows no tuples."""
+    return {key: tuple(x) if isinstance(x, list) else x for key, x in json.loads(metadata["config"]).items()}
 
 
 def _names() -> str:
