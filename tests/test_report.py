@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from idam.confidence import Evidence
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.report import MAX_POINTS, write_report
@@ -50,8 +51,9 @@ def make_pair(
     matches = Matches(source[rows], target[rows], weight / max(weight.sum(), 1))
     pairs = np.stack([np.arange(count), np.arange(count)], axis=1)
     information = np.zeros((6, 6))
+    evidence = Evidence(overlap=0.5, margin=0.2, support=0.9, votes=0.4)
     result = RegistrationResult(
-        transformation, 0.75, 0.0123, pairs, confidence, 0.05, information, matches, model, 0.042
+        transformation, 0.75, 0.0123, pairs, confidence, evidence, 0.05, information, matches, model, 0.042
     )
     return PointCloud(source), PointCloud(target), result
 
