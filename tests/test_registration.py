@@ -28,7 +28,7 @@ from idam.registration import Level, finish
 from idam.result import Matches
 
 UTM = np.array([5e5, 5.6e6, 100.0])
-SETTLED = 0.02
+SETTLED = 0.2
 """Degrees, and hundredths of the cloud's size, within which refinement ends up in the same place."""
 
 

@@ -102,8 +102,21 @@ def register(
       idam register scan1.ply scan2.ply -o aligned.ply --transform T.txt --html look.html
     """
     from idam import registration
-    from idam.io import read_point_cloud, read_transform, write_point_cloud, write_transform
+    from idam.io import (
+        check_destination,
+        check_writable,
+        read_point_cloud,
+        read_transform,
+        write_point_cloud,
+        write_transform,
+    )
 
+    # before the work, and before the first of them is written
+    if output is not None:
+        check_writable(output)
+    for path in (transform, json, html):
+        if path is not None:
+            check_destination(path)
     source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
     result = registration.register(
         source_cloud,

@@ -9,13 +9,17 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 
-__all__ = ["Frame", "check_points", "choose_voxel_size", "common_frame", "downsample"]
+__all__ = ["Frame", "check_points", "choose_voxel_size", "common_frame", "downsample", "without_strays"]
 
 Points = NDArray[np.float64]
 
 MIN_POINTS = 20
 FLATNESS = 1e-6
 """Second over first singular value of the centred cloud below which it counts as a line."""
+LARGEST = 1e100
+"""Coordinates past this overflow when squared and summed: as good as infinite."""
+STRAY = 10.0
+"""Working units from the centre past which a point is a stray: a voxel grid has no room for it."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ def check_points(points: Points, name: str) -> None:
     """Raise InputError unless points (N, 3) can be registered at all."""
     if len(points) < MIN_POINTS:
         raise InputError(f"{name}: has {len(points)} points, at least {MIN_POINTS} are needed; give a denser scan")
-    finite = np.isfinite(points).all(1)
+    finite = (np.abs(points) < LARGEST).all(1)
     if not finite.all():
         count = int((~finite).sum())
         raise InputError(f"{name}: {count} of {len(points)} points are NaN or infinite; remove them first")
@@ -92,6 +96,11 @@ def _core(points: Points) -> Points:
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     near: NDArray[np.bool_] = distance <= np.quantile(distance, 0.98)
     return points[near]
+
+
+def without_strays(points: Points) -> Points:
+    """Working points (N, 3) without those far from everything else."""
+    return points[np.linalg.norm(points, axis=1) < STRAY]
 
 
 def downsample(points: Points, voxel_size: float) -> Points:

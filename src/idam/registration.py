@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,15 @@ from idam.hypotheses import propose, starting_rotations
 from idam.io import as_point_cloud
 from idam.network.model import IDAM
 from idam.network.pretrained import DEFAULT, find, load_model
-from idam.preprocess import MIN_POINTS, Frame, check_points, choose_voxel_size, common_frame, downsample
+from idam.preprocess import (
+    MIN_POINTS,
+    Frame,
+    check_points,
+    choose_voxel_size,
+    common_frame,
+    downsample,
+    without_strays,
+)
 from idam.ranking import Answer, Surfaces, distinct, improve
 from idam.refine import METHODS, Refinable
 from idam.refine import refine as refine_once
@@ -40,6 +50,8 @@ STARTS = 24
 """Rotations of the source that the network starts from."""
 PROPOSERS = (DEFAULT, "fpfh-unseen-shapes")
 """The default's networks: learned features see more of a scan, FPFH does not mind how it is turned."""
+FINEST = 1e-4
+"""Smallest voxel size, in working units: far below the spacing of the fine clouds, and small_gicp's grid has room."""
 CONTENDERS = 4
 """Answers that stay in the race on the dense clouds."""
 
@@ -80,15 +92,17 @@ def register(
             infinity, points all equal or on one line, or an unknown model or option.
     """
     started = time.perf_counter()
-    check_options(voxel_size, max_correspondence_distance, refine)
+    check_options(voxel_size, max_correspondence_distance, refine, seed)
     source_points, target_points = (as_points(data, name) for data, name in ((source, "source"), (target, "target")))
     networks = [cached_model(name, device) for name in (PROPOSERS if model == "default" else (os.fspath(model),))]
     frame = common_frame(source_points, target_points)
     small, dense, fine = pyramid(
-        frame.source(source_points), frame.target(target_points), voxel_size and voxel_size / frame.scale
+        without_strays(frame.source(source_points)),
+        without_strays(frame.target(target_points)),
+        voxel_size and voxel_size / frame.scale,
     )
     guess = np.eye(4) if init is None else frame.enter(as_rigid(init))
-    starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
+    starts = starting_rotations(STARTS, int(seed)) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
     hypotheses = [h for network in networks for h in propose(network, small.source, small.target, starts)]
     method = refine or "none"
     answers = [Answer(hypothesis.transformation, hypothesis) for hypothesis in hypotheses]
@@ -99,7 +113,7 @@ def register(
     transformation, information = finish(answers[0], fine, method)
     full = frame.undo(transformation)
     evidence = gather_evidence(answers, small.spacing)
-    distance = max_correspondence_distance or dense.spacing * frame.scale
+    distance = float(max_correspondence_distance or dense.spacing * frame.scale)
     moved = source_points @ full[:3, :3].T + full[:3, 3]
     correspondence_set, rmse = inliers(moved, target_points, distance)
     return RegistrationResult(
@@ -117,19 +131,27 @@ def register(
     )
 
 
-def check_options(voxel_size: float | None, distance: float | None, refine: str | None) -> None:
+def check_options(voxel_size: float | None, distance: float | None, refine: str | None, seed: int) -> None:
     """Raise InputError for options out of range."""
     for name, value in (("voxel_size", voxel_size), ("max_correspondence_distance", distance)):
-        if value is not None and not (np.isfinite(value) and value > 0):
+        if value is not None and not (isinstance(value, Real) and math.isfinite(value) and value > 0):
             raise InputError(f"{name} must be a positive number, not {value}; leave it out to take it from the data")
     if refine not in (None, "none", *METHODS):
         raise InputError(f"unknown refinement {refine!r}: choose {', '.join(METHODS)} or none")
+    if not (isinstance(seed, Integral) and abs(int(seed)) < 2**63):
+        raise InputError(f"seed must be a whole number below 2^63, not {seed!r}")
 
 
 def as_points(data: Any, name: str) -> Points:
     """Points (N, 3) of anything that :func:`register` takes, checked; raise InputError where they cannot be used."""
-    points = as_point_cloud(data).points
-    check_points(points, os.fspath(data) if isinstance(data, (str, os.PathLike)) else name)
+    if isinstance(data, (str, os.PathLike)):
+        points, name = as_point_cloud(data).points, os.fspath(data)
+    else:
+        try:
+            points = as_point_cloud(data).points
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+    check_points(points, name)
     return points
 
 
@@ -142,10 +164,15 @@ def as_rigid(init: ArrayLike) -> Points:
     if matrix.shape != (4, 4):
         raise InputError(f"init must be a 4x4 matrix, not of shape {matrix.shape}")
     rotation = matrix[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    rigid = (
+        np.abs(rotation).max() < 2
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(rotation) > 0
+    )
     if not (np.isfinite(matrix).all() and rigid and np.allclose(matrix[3], [0, 0, 0, 1])):
         raise InputError("init is not a rigid transform: it needs a rotation, a translation and a last row 0 0 0 1")
-    return matrix
+    u, _, vh = np.linalg.svd(rotation)
+    return np.block([[u @ vh, matrix[:3, 3:]], [0.0, 0.0, 0.0, 1.0]])
 
 
 @lru_cache(4)
@@ -172,11 +199,22 @@ def pyramid(source: Points, target: Points, voxel_size: float | None) -> tuple[L
     fine = level(source, target, FINE_POINTS)
     dense = level(fine.source, fine.target, DENSE_POINTS)
     if voxel_size is None:
-        return level(dense.source, dense.target, NETWORK_POINTS), dense, fine
-    small = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
-    if min(map(len, small)) < MIN_POINTS:
-        raise InputError(f"a voxel size of {voxel_size:.3g} leaves {min(map(len, small))} points; give a smaller one")
-    return Level(*small, voxel_size), dense, fine
+        small = level(dense.source, dense.target, NETWORK_POINTS)
+    else:
+        clouds = [downsample(points, max(voxel_size, FINEST)) for points in (fine.source, fine.target)]
+        small = Level(*clouds, max(map(spacing, clouds)))
+    for name, points in (("source", small.source), ("target", small.target)):
+        if len(points) < MIN_POINTS:
+            raise InputError(
+                f"{name}: {len(points)} points are left at the network's resolution, at least {MIN_POINTS} are needed; "
+                "crop the other cloud to its size, or give a smaller voxel_size"
+            )
+        if len(points) > DENSE_POINTS:
+            raise InputError(
+                f"{name}: {len(points)} points are left at this voxel_size, at most {DENSE_POINTS} fit the network; "
+                "give a larger voxel_size"
+            )
+    return small, dense, fine
 
 
 def level(source: Points, target: Points, count: int) -> Level:
@@ -184,6 +222,8 @@ def level(source: Points, target: Points, count: int) -> Level:
     voxel_size = choose_voxel_size([source, target], count)
     if voxel_size > 0:
         source, target = downsample(source, voxel_size), downsample(target, voxel_size)
+    else:  # a voxel grid merges copies of a point, too
+        source, target = np.unique(source, axis=0), np.unique(target, axis=0)
     return Level(source, target, max(spacing(source), spacing(target)))
 
 

@@ -20,6 +20,7 @@ from idam.errors import InputError
 
 __all__ = [
     "StrPath",
+    "check_destination",
     "check_unpacked_size",
     "one_line",
     "read_bytes",
@@ -65,6 +66,20 @@ def write_bytes(path: StrPath, data: bytes) -> None:
         InputError: the folder is missing, or the file cannot be written.
     """
     try:
+        _replace(check_destination(path), data)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be written ({one_line(error)}): write to another folder") from error
+
+
+def check_destination(path: StrPath) -> Path:
+    """Find the file that writing to ``path`` will write.
+
+    Raises:
+        InputError: it cannot be written, as far as one can tell without trying.
+    """
+    try:
         target = Path(os.path.realpath(path))  # through a symbolic link, not over it
         if not target.parent.is_dir():
             raise InputError(f"{path}: there is no folder {Path(path).parent}: create it first")
@@ -72,11 +87,13 @@ def write_bytes(path: StrPath, data: bytes) -> None:
             raise InputError(f"{path}: is a folder: name a file in it")
         if target.exists() and not (target.is_file() and os.access(target, os.W_OK)):
             raise InputError(f"{path}: is write-protected or not a regular file: write to another file")
-        _replace(target, data)
-    except InputError:
-        raise
+        if not os.access(target.parent, os.W_OK):
+            raise InputError(f"{path}: its folder is write-protected: write to another folder")
     except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: cannot be written ({one_line(error)}): write to another folder") from error
+    return target
 
 
 def _replace(target: Path, data: bytes) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 from idam.errors import InputError, MissingDependencyError
 from idam.io import arrays, las, mesh, pcd, ply, text
 from idam.io.cloud import PointCloud
-from idam.io.files import StrPath, one_line, read_bytes, write_bytes
+from idam.io.files import StrPath, check_destination, one_line, read_bytes, write_bytes
 
-__all__ = ["read_point_cloud", "write_point_cloud"]
+__all__ = ["check_writable", "read_point_cloud", "write_point_cloud"]
 
 _DECODERS: dict[str, Callable[[bytes], PointCloud]] = {
     ".ply": ply.decode,
@@ -82,13 +82,28 @@ def write_point_cloud(path: StrPath, cloud: Any) -> None:
     """
     from idam.io.convert import as_point_cloud
 
-    encode = _ENCODERS.get(Path(path).suffix.lower())
-    if encode is None:
-        raise _unknown(path, "write", _ENCODERS)
+    encode = _encoder(path)
     cloud = as_point_cloud(cloud)
     with np.errstate(all="ignore"):
         data = encode(cloud)
     write_bytes(path, data)
+
+
+def check_writable(path: StrPath) -> None:
+    """Find out before a long computation whether :func:`write_point_cloud` can write to ``path``.
+
+    Raises:
+        InputError: it cannot.
+    """
+    _encoder(path)
+    check_destination(path)
+
+
+def _encoder(path: StrPath) -> Callable[[PointCloud], bytes]:
+    encode = _ENCODERS.get(Path(path).suffix.lower())
+    if encode is None:
+        raise _unknown(path, "write", _ENCODERS)
+    return encode
 
 
 def _unknown(path: StrPath, verb: str, known: Iterable[str]) -> InputError:

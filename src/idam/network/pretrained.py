@@ -47,7 +47,11 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         reason = str(error).splitlines()[0][:120]
         raise InputError(f"{path}: not a model that idam wrote ({reason}); use one of {_names()}") from None
-    return model.eval().requires_grad_(False).to(device or "cpu")
+    try:
+        return model.eval().requires_grad_(False).to(device or "cpu")
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0][:120]
+        raise InputError(f"device {str(device)!r} cannot be used ({reason}); leave it out for the CPU") from None
 
 
 def provenance(name: str | os.PathLike[str]) -> dict[str, Any]:
