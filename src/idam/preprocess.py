@@ -100,7 +100,8 @@ def _core(points: Points) -> Points:
 
 def without_strays(points: Points) -> Points:
     """Working points (N, 3) without those far from everything else."""
-    return points[np.linalg.norm(points, axis=1) < STRAY]
+    near: NDArray[np.bool_] = np.linalg.norm(points, axis=1) < STRAY
+    return points[near]
 
 
 def downsample(points: Points, voxel_size: float) -> Points:

@@ -201,8 +201,9 @@ def pyramid(source: Points, target: Points, voxel_size: float | None) -> tuple[L
     if voxel_size is None:
         small = level(dense.source, dense.target, NETWORK_POINTS)
     else:
-        clouds = [downsample(points, max(voxel_size, FINEST)) for points in (fine.source, fine.target)]
-        small = Level(*clouds, max(map(spacing, clouds)))
+        voxel_size = max(voxel_size, FINEST)
+        few = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
+        small = Level(few[0], few[1], max(map(spacing, few)))
     for name, points in (("source", small.source), ("target", small.target)):
         if len(points) < MIN_POINTS:
             raise InputError(
