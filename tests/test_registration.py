@@ -487,12 +487,16 @@ def test_refuses_what_is_not_rigid(init: Any) -> None:
 # --- the shipped scans ---------------------------------------------------------------------------------------------
 
 
-def test_shipped_scans() -> None:
+@pytest.mark.parametrize(
+    "turn", [Rotation.identity(), Rotation.from_rotvec([2.0, -1.0, 1.5])], ids=["as shipped", "turned"]
+)
+def test_shipped_scans(turn: Rotation) -> None:
     with resources.as_file(resources.files("idam") / "data" / "demo") as folder:
-        source, target = folder / "source.ply", folder / "target.ply"
-        truth = np.loadtxt(folder / "truth.txt")
-        centre = trimesh.load(source).vertices.mean(0)
-        found = idam.register(source, target)
+        source, target = (np.asarray(trimesh.load(folder / name).vertices) for name in ("source.ply", "target.ply"))
+        truth = np.loadtxt(folder / "truth.txt") @ rigid(turn, 0.0).T
+    source = turn.apply(source)
+    found = idam.register(source, target)
     assert degrees(found.transformation, truth) < 5.0
-    assert np.linalg.norm(found.apply(centre) - move(truth, centre)) < 0.01
+    assert np.linalg.norm(found.apply(source.mean(0)) - move(truth, source.mean(0))) < 0.01
     assert found.fitness > 0.5
+    assert found.confidence > 0.5
