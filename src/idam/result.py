@@ -41,7 +41,8 @@ class RegistrationResult:
         confidence: probability in [0, 1] that the transform is right.
         evidence: what the confidence was computed from.
         max_correspondence_distance: the distance the above were measured at, in the input's units.
-        information: (6, 6) information matrix of the fine alignment, rotation before translation; zero if it was off.
+        information: (6, 6) information matrix of the fine alignment, rotation before translation, in the centred and
+            scaled coordinates the alignment ran in; zero if it was off.
         matches: the network's weighted matches of key points.
         model: name of the network's weights.
         seconds: wall-clock time it took.
