@@ -201,7 +201,7 @@ TORCHRUN = (*TORCHRUN, "--local-addr=127.0.0.1", "-m", "idam")
 
 @pytest.fixture
 def one_thread():
-    """As torchrun's processes have: sums in another order differ by rounding, and Adam makes steps of the difference."""
+    """As torchrun's processes have: sums in another order round otherwise, and Adam makes steps of the difference."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
