@@ -12,7 +12,7 @@ from idam.geometry import compose, gather_points, random_rotation
 from idam.network.model import IDAM, KeyPoints
 from idam.result import Matches
 
-__all__ = ["Hypothesis", "propose", "starting_rotations"]
+__all__ = ["Hypothesis", "nearest_rotation", "propose", "starting_rotations"]
 
 Points = NDArray[np.float64]
 
@@ -85,14 +85,14 @@ def _run(network: IDAM, source: KeyPoints, target: KeyPoints, starts: torch.Tens
     hypotheses = []
     for n in range(len(starts)):
         transformation = np.eye(4)
-        transformation[:3, :3] = _nearest_rotation(rotation[n].double().cpu().numpy())
+        transformation[:3, :3] = nearest_rotation(rotation[n].double().cpu().numpy())
         transformation[:3, 3] = translation[n].double().cpu().numpy()
         matches = Matches(*(x[n].double().cpu().numpy() for x in (keys, last.match, last.weight)))
         hypotheses.append(Hypothesis(transformation, matches, float(output.trust[n])))
     return hypotheses
 
 
-def _nearest_rotation(matrix: Points) -> Points:
-    """The rotation nearest to one (3, 3) composed in single precision."""
+def nearest_rotation(matrix: Points) -> Points:
+    """The rotation nearest to one (3, 3) that is inexact: composed in single precision, or written with few digits."""
     u, _, vh = np.linalg.svd(matrix)
     return np.asarray(u @ vh)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from idam.confidence import Evidence, confidence
 from idam.errors import InputError
-from idam.hypotheses import propose, starting_rotations
+from idam.hypotheses import nearest_rotation, propose, starting_rotations
 from idam.io import as_point_cloud
 from idam.network.model import IDAM
 from idam.network.pretrained import DEFAULT, find, load_model
@@ -171,8 +171,7 @@ def as_rigid(init: ArrayLike) -> Points:
     )
     if not (np.isfinite(matrix).all() and rigid and np.allclose(matrix[3], [0, 0, 0, 1])):
         raise InputError("init is not a rigid transform: it needs a rotation, a translation and a last row 0 0 0 1")
-    u, _, vh = np.linalg.svd(rotation)
-    return np.block([[u @ vh, matrix[:3, 3:]], [0.0, 0.0, 0.0, 1.0]])
+    return np.block([[nearest_rotation(rotation), matrix[:3, 3:]], [0.0, 0.0, 0.0, 1.0]])
 
 
 @lru_cache(4)
