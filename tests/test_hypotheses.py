@@ -14,7 +14,8 @@ from torch import Tensor
 
 from idam.geometry import random_rotation, weighted_procrustes
 from idam.hypotheses import propose, starting_rotations
-from idam.network.model import IDAM, Config, KeyPoints, Output
+from idam.network.config import Config
+from idam.network.model import IDAM, KeyPoints, Output
 from idam.network.pretrained import load_model
 
 SHIFT = torch.tensor([0.3, -0.2, 0.1])

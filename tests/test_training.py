@@ -24,7 +24,8 @@ from idam.data.pairs import Pairs, experiment_noise
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform
-from idam.network.model import IDAM, Config
+from idam.network.config import Config
+from idam.network.model import IDAM
 from idam.network.pretrained import load_model, provenance, save_model
 from idam.network.supervision import Loss
 from idam.training import Batch, Recipe, SupervisedStep, batch_at, split_validation, train, validate

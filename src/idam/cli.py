@@ -188,6 +188,13 @@ def train(
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
     ] = False,
+    noise: Annotated[
+        float | None, typer.Option(help="Sigma of the noise on both clouds; the experiment's own if left out.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A field of the network's configuration, as iterations=20."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the weights, pairs and samples.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     precision: Annotated[str, typer.Option(help="32 or bf16.")] = "32",
@@ -204,19 +211,20 @@ def train(
 
       torchrun --nproc-per-node 4 -m idam train unseen-shapes --data modelnet40
     """
-    from idam.network.model import Config
+    from idam.network.config import Config, with_settings
     from idam.training import Recipe
     from idam.training import train as run
 
     recipe = Recipe(
         experiment=experiment,
-        config=Config(features=features),
+        config=with_settings(Config(features=features), settings or ()),
         epochs=epochs,
         batch_size=batch_size,
         schedule=schedule,
         learning_rate=learning_rate,
         start=start,
         eliminate=eliminate,
+        noise=noise,
         seed=seed,
     )
     best = run(

@@ -22,8 +22,9 @@ from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform, gather_points
 from idam.io.files import one_line
 from idam.memory import keep_freed_memory
+from idam.network.config import Config
 from idam.network.elimination import keep_most_significant
-from idam.network.model import IDAM, Config, KeyPoints
+from idam.network.model import IDAM, KeyPoints
 from idam.network.pretrained import load_model, save_model
 from idam.network.sampling import balanced_sample
 from idam.network.supervision import Loss, mutual_supervision
@@ -48,7 +49,9 @@ class Recipe:
         learning_rate: Adam's, at its highest.
         weight_decay: Adam's.
         radius: r of the loss and of balanced sampling.
+        noise: sigma of the noise on both clouds; None for the experiment's own.
         keep: share of points that balanced sampling draws.
+        iterations: iterations of a training step; the configuration's are those after training.
         eliminate: let hard elimination choose the target points, and half of the source points, as it does after
             training; balanced sampling chooses the other half.
         start: name or file of a model whose weights to start from; None for random ones.
@@ -63,15 +66,17 @@ class Recipe:
     learning_rate: float = 1e-4
     weight_decay: float = 1e-3
     radius: float = 0.05
+    noise: float | None = None
     keep: float = 1 / 6
+    iterations: int = 3
     eliminate: bool = False
     start: str | None = None
     seed: int = 0
 
     @property
-    def noise(self) -> float:
+    def sigma(self) -> float:
         """Sigma of the noise on both clouds."""
-        return experiment_noise(self.experiment)
+        return experiment_noise(self.experiment) if self.noise is None else self.noise
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the training, in [0, 1)."""
@@ -111,7 +116,9 @@ class SupervisedStep(nn.Module):
             source_features, target_features = self.model.encode(batch.source, batch.target)
             source = self._sample(batch.source, source_features, batch.source_index)
             target = self._sample(batch.target, target_features, batch.target_index, all_eliminated=True)
-            iterations = self.model.iterate(source.points, target.points, source.features, target.features)
+            iterations = self.model.iterate(
+                source.points, target.points, source.features, target.features, self.recipe.iterations
+            )
         return mutual_supervision(
             iterations,
             source.points,
@@ -163,7 +170,7 @@ def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -
     order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
     rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
     generator = torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
-    pairs = make_pairs(shapes.points[rows], generator, recipe.noise)
+    pairs = make_pairs(shapes.points[rows], generator, recipe.sigma)
     aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
     count = math.ceil(recipe.keep * pairs.source.shape[1] - 1e-9)
     source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)
@@ -228,7 +235,7 @@ def train(
     fabric.launch()
     torch.manual_seed(recipe.seed)
     shapes, validation = split_validation(
-        experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.noise
+        experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.sigma
     )
     check_batch(recipe.batch_size, len(shapes), fabric.world_size)
     total = max(1, round(recipe.epochs * (len(shapes) // recipe.batch_size)))
@@ -276,6 +283,8 @@ def check(recipe: Recipe) -> None:
     positive = (recipe.epochs, recipe.learning_rate, recipe.radius)
     if not all(0 < value < math.inf for value in positive) or recipe.batch_size < 2:
         raise InputError("epochs, the learning rate and the radius must be positive, and the batch at least 2 pairs")
+    if not 0 <= recipe.sigma < math.inf:
+        raise InputError(f"cannot add noise of sigma {recipe.sigma:g}: choose 0 or more, in the shapes' units")
     if not 0 < recipe.keep <= 1:
         raise InputError(f"cannot sample a share of {recipe.keep:g} of the points: choose one in (0, 1]")
     if abs(recipe.seed) >= 2**31:

@@ -10,7 +10,8 @@ import torch
 
 from idam.errors import InputError
 from idam.evaluation.methods import METHODS, build_method, network, pipeline
-from idam.network.model import IDAM, Config
+from idam.network.config import Config
+from idam.network.model import IDAM
 from idam.network.pretrained import save_model
 
 NETWORKS = {"gnn-idam": "gnn", "fpfh-idam": "fpfh"}

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from idam.geometry import apply_transform, gather_points, weighted_procrustes
+from idam.network.config import Config
 from idam.network.elimination import hybrid_weights
 from idam.network.features import GNN, build_features
-from idam.network.model import IDAM, Config
+from idam.network.model import IDAM
 from idam.network.similarity import SimilarityConvolution
 
 SMALL = {"neighbours": 5, "channels": 8, "keep": 1 / 2}

@@ -10,7 +10,8 @@ from safetensors.torch import save_file
 
 from idam.errors import InputError
 from idam.network import pretrained
-from idam.network.model import IDAM, Config
+from idam.network.config import Config
+from idam.network.model import IDAM
 from idam.network.pretrained import list_models, load_model, provenance, save_model
 
 CONFIG = Config(neighbours=5, channels=8, blocks=2, iterations=4, keep=0.3, soft_matches=True)

@@ -8,49 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from idam.geometry import apply_transform, compose, gather_points, weighted_procrustes
+from idam.network.config import Config
 from idam.network.elimination import Significance, Validity, hybrid_weights, keep_most_significant
 from idam.network.features import build_features
 from idam.network.similarity import SimilarityConvolution
 
-__all__ = ["IDAM", "Config", "Iteration", "KeyPoints", "Output"]
-
-
-TRUSTED = 0.9
-"""Mean validity of the last iteration's matches from which no other try is made."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """What makes one IDAM different from another; the defaults are the paper's.
-
-    Attributes:
-        features: ``gnn`` (appendix A) or ``fpfh``.
-        neighbours: K of the GNN's graph.
-        normal_radius: radius of FPFH's normals, in the cloud's units.
-        feature_radius: radius of FPFH's histograms, in the cloud's units.
-        channels: channels of the similarity convolution.
-        blocks: iterations that have weights of their own.
-        iterations: iterations run; those past ``blocks`` use the last block's weights again.
-        keep: share of each cloud's points that hard elimination keeps.
-        keep_again: shares to try next, in turn, where the validity says that the matches are not to be trusted; the
-            iterations run twice as often then. Empty is the paper's inference. Beyond it, since of two clouds' most
-            significant points too few may be the same: the validity notices, and more points mend it.
-        keep_matches: share of matches that hybrid elimination keeps.
-        soft_matches: match a point to its row's expectation (the mean of the target, weighted by similarity) rather
-            than to the row's best target point.
-    """
-
-    features: str = "gnn"
-    neighbours: int = 12
-    normal_radius: float = 0.1
-    feature_radius: float = 0.2
-    channels: int = 32
-    blocks: int = 3
-    iterations: int = 3
-    keep: float = 1 / 6
-    keep_again: tuple[float, ...] = ()
-    keep_matches: float = 0.5
-    soft_matches: bool = False
+__all__ = ["IDAM", "Iteration", "KeyPoints", "Output"]
 
 
 @dataclass(frozen=True)
@@ -157,10 +120,10 @@ class IDAM(nn.Module):
         features = self.encode(source, target)
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
         for keep in self.config.keep_again:
-            if bool((output.trust >= TRUSTED).all()):
+            if bool((output.trust >= self.config.trusted).all()):
                 break
             key_points = self.eliminate(source, features[0], keep), self.eliminate(target, features[1], keep)
-            output = better(output, self.match(*key_points, 2 * self.config.iterations))
+            output = better(output, self.match(*key_points, 2 * self.config.iterations), self.config.trusted)
         return output
 
     def encode(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -217,9 +180,9 @@ class IDAM(nn.Module):
         return Iteration(source, score, match, correspondence, validity_logit, weight, rotation, translation)
 
 
-def better(first: Output, second: Output) -> Output:
+def better(first: Output, second: Output, trusted: float) -> Output:
     """Both tries as one: for each pair the second, where the first is not trusted and the second is trusted more."""
-    take = (first.trust < TRUSTED) & (second.trust > first.trust)
+    take = (first.trust < trusted) & (second.trust > first.trust)
     keys = second if bool(take.any()) else first
     return Output(
         torch.where(take[:, None, None], second.rotation, first.rotation),

@@ -14,7 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from idam.errors import InputError
-from idam.network.model import IDAM, Config
+from idam.network.config import Config
+from idam.network.model import IDAM
 
 __all__ = ["list_models", "load_model", "provenance", "save_model"]
 

@@ -8,7 +8,7 @@ from idam.network.features.fpfh import FPFH
 from idam.network.features.gnn import GNN
 
 if TYPE_CHECKING:
-    from idam.network.model import Config
+    from idam.network.config import Config
 
 __all__ = ["FPFH", "GNN", "build_features"]
 
