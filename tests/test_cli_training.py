@@ -19,7 +19,8 @@ from idam import cli, training
 from idam.data.modelnet40 import experiment_shapes
 from idam.data.pairs import Pairs
 from idam.evaluation import experiments
-from idam.evaluation.methods import build_method
+from idam.evaluation.experiments import TestSet
+from idam.evaluation.runner import Task, run
 from idam.network.pretrained import list_models, load_model, provenance
 from idam.training import Recipe, SupervisedStep, batch_at, initial_model, split_validation
 
@@ -211,7 +212,7 @@ def one_thread():
 def on_averaged_gradients(recipe: Recipe, data: Path, steps: int) -> dict[str, torch.Tensor]:
     """Weights after some steps with the mean of the gradients that two processes see."""
     torch.manual_seed(recipe.seed)
-    shapes, _ = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.noise)
+    shapes, _ = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.sigma)
     module = SupervisedStep(initial_model(recipe), recipe, "32")
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     for step in range(steps):
@@ -244,7 +245,7 @@ def test_two_processes_train_one_model_on_the_mean_of_their_gradients(trainable,
 
 # idam evaluate
 
-FIGURES = ("rmse_r", "mae_r", "rmse_t", "mae_t", "recall")
+FIGURES = ("rmse_r", "mae_r", "rmse_t", "mae_t", "recall", "angle", "distance")
 
 
 @pytest.fixture
@@ -265,8 +266,8 @@ def file(tmp_path: Path, pairs: Pairs) -> Path:
 
 def measured(pairs: Pairs) -> dict[str, float]:
     """What the shipped network does on pairs."""
-    method = build_method("gnn-idam", "gnn-unseen-shapes")
-    figures = experiments.run("", method, pairs, None, lambda: None).metrics.to_dict()
+    task = Task("gnn-idam", "gnn-unseen-shapes")
+    figures = run(task, TestSet("", pairs, ""), lambda: None).metrics.to_dict()
     return {name: pytest.approx(value, rel=1e-5) for name, value in figures.items()}
 
 
@@ -276,7 +277,10 @@ def test_anyone_s_pairs_are_measured_into_a_json_file(idam, file, pairs, tmp_pat
     assert outcome.code == 0
     found = json.loads((tmp_path / "out.json").read_text())
     (row,) = found.pop("rows")
-    assert found == {"pairs_from": str(file), **row}
+    about = {"pairs_from": str(file), "seed": experiments.TEST_SEED, "checksum": experiments.read_pairs(file).checksum}
+    assert found.items() >= (row | about).items()
+    assert found["command"].startswith("idam evaluate --pairs")
+    assert found["machine"]["torch"] == torch.__version__
     assert {name: row[name] for name in FIGURES} == measured(pairs)
     assert row["method"] == "gnn-idam"
     assert row["model"] == "gnn-unseen-shapes"
@@ -302,7 +306,6 @@ def test_every_method_asked_for_has_a_row(idam, file, tmp_path):
     )
     assert outcome.code == 0
     found = json.loads((tmp_path / "out.json").read_text())
-    assert found.keys() == {"pairs_from", "rows"}
     assert [row["method"] for row in found["rows"]] == ["register", "gnn-idam"]
     for row in found["rows"]:
         assert all(math.isfinite(row[name]) for name in FIGURES)
@@ -324,7 +327,7 @@ def test_an_experiment_is_measured_on_its_test_pairs(experiment, count, idam, da
     found = json.loads((tmp_path / "out.json").read_text())
     assert found["pairs_from"] == experiment
     assert found["pairs"] == count
-    assert {name: found[name] for name in FIGURES} == measured(experiments.test_pairs(experiment, data))
+    assert {name: found[name] for name in FIGURES} == measured(experiments.test_set(experiment, data).pairs)
 
 
 def not_pairs(path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -13,9 +13,6 @@ from idam import __version__
 from idam.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from idam.evaluation.experiments import Row
     from idam.result import RegistrationResult
 
 __all__ = ["main"]
@@ -35,7 +32,6 @@ app = typer.Typer(
 )
 
 Data = Annotated[Path, typer.Option("--data", help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")]
-Json = Annotated[Path | None, typer.Option("--json", help="Also write the figures to this JSON file.")]
 
 
 def main() -> NoReturn:
@@ -211,7 +207,8 @@ def train(
 
       torchrun --nproc-per-node 4 -m idam train unseen-shapes --data modelnet40
     """
-    from idam.network.config import Config, with_settings
+    from idam.network.config import Config
+    from idam.settings import with_settings
     from idam.training import Recipe
     from idam.training import train as run
 
@@ -243,26 +240,38 @@ def train(
 @app.command()
 def evaluate(
     experiment: Annotated[
-        str | None, typer.Argument(help="unseen-shapes, unseen-categories or gaussian-noise; or give --pairs.")
+        str | None,
+        typer.Argument(
+            help="unseen-shapes, unseen-categories, gaussian-noise, practice or practice-any-rotation; or give --pairs."
+        ),
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")] = None,
     pairs: Annotated[Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="Rows to compute; all if left out.")] = None,
-    model: Annotated[str | None, typer.Option(help="Weights for the idam rows.")] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Weights for the idam rows; those trained for the experiment if left out.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the one method asked for."),
+    ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only so many pairs, for a quick look.")] = None,
-    json: Json = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the pairs.")] = 1,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the rows here, after each of them.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the rows that the JSON file has already.")] = False,
 ) -> None:
-    """Measure methods on the pairs of an experiment, or on your own.
+    """Measure methods on the pairs of an experiment, or on your own; the paper's figures stand in brackets.
 
     [bold]Examples[/bold]
 
       idam evaluate unseen-shapes --data modelnet40 --limit 100
 
+      idam evaluate gaussian-noise --data modelnet40 --method fgr --set fgr_distance=0.05
+
       idam evaluate --pairs pairs.npz --method gnn-idam --model gnn-unseen-shapes --json out.json
     """
-    from idam.evaluation.experiments import read_pairs, run, test_pairs
-    from idam.evaluation.methods import METHODS, build_method
-    from idam.io import write_json
+    from idam.evaluation.evaluate import evaluate as run
+    from idam.evaluation.experiments import read_pairs, test_set
 
     if (experiment is None) == (pairs is None):
         raise InputError("give either an experiment with --data or your own --pairs")
@@ -271,62 +280,17 @@ def evaluate(
     elif data is None:
         raise InputError("an experiment needs --data, the folder of ModelNet40")
     else:
-        test = test_pairs(str(experiment), data)
-    if limit is not None:
-        test = test[:limit]
-    names = method or list(METHODS)
-    built = [build_method(name, model) for name in names]
-    rows: list[Row] = []
-    with progress_bar(len(test) * len(names)) as advance:
-        for name, registers in zip(names, built, strict=True):
-            rows.append(run(name, registers, test, model, advance))
-            if json is not None:
-                write_json(json, record(rows, str(experiment or pairs)))
-    from rich.console import Console
-
-    Console().print(results_table(rows))
-
-
-def record(rows: list[Row], what: str) -> dict[str, Any]:
-    """What ``--json`` holds: the rows, and the only row's figures at the top as well."""
-    single = rows[0].to_dict() if len(rows) == 1 else {}
-    return {"pairs_from": what, **single, "rows": [row.to_dict() for row in rows]}
-
-
-def results_table(rows: list[Row]) -> Table:
-    """The rows as the paper sets them: rotation in degrees, translation in the clouds' unit."""
-    from rich.table import Table
-
-    table = Table("method", "RMSE(R)", "MAE(R)", "RMSE(t)", "MAE(t)", "recall", "ms a pair")
-    for row in rows:
-        m = row.metrics
-        table.add_row(
-            row.method,
-            f"{m.rmse_r:.3f}",
-            f"{m.mae_r:.3f}",
-            f"{m.rmse_t:.4f}",
-            f"{m.mae_t:.4f}",
-            f"{m.recall:.3f}",
-            f"{row.seconds_per_pair * 1000:.1f}",
-        )
-    return table
-
-
-def progress_bar(total: int) -> Any:
-    """A context manager that shows a bar on stderr and gives the function that advances it."""
-    from contextlib import contextmanager
-
-    from rich.console import Console
-    from rich.progress import Progress
-
-    @contextmanager
-    def bar() -> Any:
-        console = Console(stderr=True)
-        with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-            task = progress.add_task("registering", total=total)
-            yield lambda: progress.advance(task)
-
-    return bar()
+        test = test_set(str(experiment), data)
+    run(
+        test if limit is None else test.first(limit),
+        method,
+        model=model,
+        settings=settings or (),
+        jobs=jobs,
+        output=json,
+        resume=resume,
+        command=shlex.join(["idam", *sys.argv[1:]]),
+    )
 
 
 @app.command()

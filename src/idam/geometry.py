@@ -19,6 +19,7 @@ __all__ = [
     "invert",
     "nearest",
     "nearest_neighbours",
+    "quaternion_to_rotation",
     "random_rotation",
     "rotation_angle",
     "rotation_to_euler_zyx",
@@ -85,8 +86,12 @@ def random_rotation(
     count: int, *, generator: torch.Generator | None = None, dtype: torch.dtype | None = None
 ) -> Tensor:
     """``count`` rotations (count, 3, 3) drawn uniformly from SO(3), from normalised Gaussian quaternions."""
-    quaternion = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator, dtype=dtype), dim=-1)
-    w, x, y, z = quaternion.unbind(-1)
+    return quaternion_to_rotation(torch.randn(count, 4, generator=generator, dtype=dtype))
+
+
+def quaternion_to_rotation(quaternion: Tensor) -> Tensor:
+    """Rotation (..., 3, 3) of a quaternion (..., 4), scalar first, of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -1,9 +1,8 @@
-"""Test pairs, anyone's own pairs, and methods run over them."""
+"""Test pairs, and anyone's own pairs."""
 
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,10 @@ import pytest
 import torch
 
 from idam.data.modelnet40 import Shapes
-from idam.data.pairs import EXPERIMENTS, Pairs, make_pairs
+from idam.data.pairs import EXPERIMENTS, Pairs
 from idam.errors import InputError
 from idam.evaluation import experiments
-from idam.evaluation.experiments import Row, read_pairs, run
-from idam.evaluation.metrics import Metrics, measure
+from idam.evaluation.experiments import AXISYMMETRIC, TABLES, read_pairs
 from idam.geometry import random_rotation
 from idam.training import split_validation
 
@@ -37,22 +35,22 @@ def shapes(monkeypatch: pytest.MonkeyPatch, randn) -> Shapes:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_test_pairs_depend_on_nothing_but_the_shapes(experiment, shapes):
-    pairs = experiments.test_pairs(experiment, "anywhere")
+    pairs = experiments.test_set(experiment, "anywhere").pairs
     torch.manual_seed(99)
-    assert same(experiments.test_pairs(experiment, "elsewhere"), pairs)
+    assert same(experiments.test_set(experiment, "elsewhere").pairs, pairs)
     assert pairs.source.shape == pairs.target.shape == (6, 768, 3)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_the_first_test_pairs_are_those_of_the_first_shapes(experiment, shapes, monkeypatch):
-    pairs = experiments.test_pairs(experiment, "anywhere")
+    pairs = experiments.test_set(experiment, "anywhere").pairs
     monkeypatch.setattr(experiments, "experiment_shapes", lambda *_: Shapes(shapes.points[:2], shapes.labels[:2]))
-    assert same(experiments.test_pairs(experiment, "anywhere"), pairs[:2])
+    assert same(experiments.test_set(experiment, "anywhere").pairs, pairs[:2])
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_only_the_noise_experiment_tests_with_noise(experiment, shapes):
-    pairs = experiments.test_pairs(experiment, "anywhere")
+    pairs = experiments.test_set(experiment, "anywhere").pairs
     for source, points in zip(pairs.source, shapes.points, strict=True):
         exact = (source[:20, None] == points).all(-1).any(-1)
         assert exact.all() == (experiment != "gaussian-noise")
@@ -61,19 +59,50 @@ def test_only_the_noise_experiment_tests_with_noise(experiment, shapes):
 def test_the_test_split_of_the_experiment_is_read(monkeypatch, shapes):
     asked = []
     monkeypatch.setattr(experiments, "experiment_shapes", lambda *args: (asked.append(args), shapes)[1])
-    experiments.test_pairs("unseen-categories", "a folder")
+    experiments.test_set("unseen-categories", "a folder")
     assert asked == [("unseen-categories", "a folder", "test")]
 
 
 def test_test_pairs_are_other_ones_than_those_that_pick_the_checkpoint(shapes):
     _, validation = split_validation(Shapes(shapes.points.repeat(10, 1, 1), torch.arange(60)), 0, 0.0)
-    test = experiments.test_pairs("unseen-shapes", "anywhere")
+    test = experiments.test_set("unseen-shapes", "anywhere").pairs
     assert torch.cdist(test.translation, validation.translation).min() > 1e-4
 
 
 def test_an_unknown_experiment_is_refused_with_the_known_ones(shapes):
     with pytest.raises(InputError, match=r"'seen-shapes'.*unseen-shapes, unseen-categories, gaussian-noise"):
-        experiments.test_pairs("seen-shapes", "anywhere")
+        experiments.test_set("seen-shapes", "anywhere")
+
+
+@pytest.mark.parametrize("experiment", TABLES)
+def test_a_checksum_tells_the_draws_and_the_shapes_apart(experiment, shapes, monkeypatch):
+    checksum = experiments.test_set(experiment, "anywhere").checksum
+    assert experiments.test_set(experiment, "anywhere").checksum == checksum
+    other = shapes.points.clone()
+    other[5, 1023, 2] += 1e-3
+    for seed, points in ((experiments.TEST_SEED + 1, shapes.points), (experiments.TEST_SEED, other)):
+        with monkeypatch.context() as changed:
+            changed.setattr(experiments, "TEST_SEED", seed)
+            changed.setattr(experiments, "experiment_shapes", lambda *_, p=points: Shapes(p, shapes.labels))
+            assert experiments.test_set(experiment, "anywhere").checksum != checksum
+
+
+def test_the_axisymmetric_categories_are_set_apart(monkeypatch, randn):
+    every = Shapes(randn(40, 1024, 3, dtype=torch.float32), torch.arange(40))
+    monkeypatch.setattr(experiments, "experiment_shapes", lambda *_: every)
+    observable = experiments.test_set("practice", "anywhere").observable
+    assert (~observable).nonzero().flatten().tolist() == list(AXISYMMETRIC)
+    assert len(AXISYMMETRIC) == 8
+
+
+def test_the_first_pairs_keep_what_belongs_to_them(shapes):
+    test = experiments.test_set("practice", "anywhere")
+    first = test.first(2)
+    assert same(first.pairs, test.pairs[:2])
+    assert (first.name, first.checksum) == (test.name, test.checksum)
+    assert torch.equal(first.labels, test.labels[:2])
+    assert torch.equal(first.whole, test.whole[:2])
+    assert len(first) == 2
 
 
 # anyone's own pairs
@@ -103,7 +132,7 @@ def save(tmp_path: Path, generator) -> Callable[..., Path]:
 def test_pairs_are_read_as_they_were_saved(number, savez, save, tmp_path):
     arrays = {key: value.astype(number) for key, value in np.load(save(more=np.zeros(3))).items()}
     savez(tmp_path / "again.npz", **arrays)
-    pairs = read_pairs(str(tmp_path / "again.npz"))
+    pairs = read_pairs(str(tmp_path / "again.npz")).pairs
     assert len(pairs) == 2
     for key, field in zip(("source", "target", "R", "t"), dataclasses.fields(Pairs), strict=True):
         read = getattr(pairs, field.name)
@@ -177,80 +206,3 @@ def test_a_file_that_holds_no_pairs_is_refused_in_one_line(spoil, save):
     with pytest.raises(InputError, match=r"pairs\.npz: ") as caught:
         read_pairs(path)
     assert "\n" not in str(caught.value)
-
-
-# running a method
-
-
-@pytest.fixture
-def pairs(randn, generator) -> Pairs:
-    return make_pairs(randn(5, 40, 3, dtype=torch.float32), generator)
-
-
-def ignore() -> None:
-    pass
-
-
-def test_a_method_that_knows_the_truth_makes_no_error(pairs):
-    seen = []
-
-    def know(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        transformation = np.eye(4)
-        transformation[:3, :3], transformation[:3, 3] = pairs.rotation[len(seen)], pairs.translation[len(seen)]
-        seen.append((source, target))
-        return transformation
-
-    row = run("oracle", know, pairs, None, ignore)
-    assert row.metrics == Metrics(0, 0, 0, 0, 1)
-    assert (row.method, row.model, row.pairs) == ("oracle", None, 5)
-    for n, clouds in enumerate(seen):  # each pair by itself, as a user has them
-        for cloud, expected in zip(clouds, (pairs.source, pairs.target), strict=True):
-            assert cloud.dtype == np.float32
-            np.testing.assert_array_equal(cloud, expected[n])
-
-
-def test_a_method_that_does_nothing_errs_by_the_transforms(pairs):
-    row = run("identity", lambda *_: np.eye(4), pairs, None, ignore)
-    nothing = torch.eye(3).expand(5, 3, 3), torch.zeros(5, 3)
-    assert row.metrics == measure(*nothing, pairs.rotation, pairs.translation)
-    assert row.metrics.recall < 1
-
-
-def test_progress_is_told_after_every_pair(pairs):
-    told, done = [], []
-
-    def method(*_: np.ndarray) -> np.ndarray:
-        done.append(1)
-        return np.eye(4)
-
-    run("identity", method, pairs, None, lambda: told.append(len(done)))
-    assert told == [1, 2, 3, 4, 5]
-
-
-def test_the_time_is_the_median_of_the_method_s_own(pairs, monkeypatch):
-    clock, durations = SimpleNamespace(now=0.0), iter([1.0, 100.0, 3.0, 2.0, 50.0])
-
-    def method(*_: np.ndarray) -> np.ndarray:
-        clock.now += next(durations)
-        return np.eye(4)
-
-    def advance() -> None:
-        clock.now += 1000.0
-
-    monkeypatch.setattr(experiments, "time", SimpleNamespace(perf_counter=lambda: clock.now))
-    assert run("slow", method, pairs, None, advance).seconds_per_pair == 3.0
-
-
-def test_a_row_is_one_flat_record():
-    metrics = Metrics(rmse_r=1.0, mae_r=2.0, rmse_t=3.0, mae_t=4.0, recall=0.5)
-    assert Row("icp", "a model", metrics, 0.1, 7).to_dict() == {
-        "method": "icp",
-        "model": "a model",
-        "pairs": 7,
-        "rmse_r": 1.0,
-        "mae_r": 2.0,
-        "rmse_t": 3.0,
-        "mae_t": 4.0,
-        "recall": 0.5,
-        "seconds_per_pair": 0.1,
-    }

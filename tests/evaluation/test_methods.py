@@ -12,7 +12,7 @@ from idam.errors import InputError
 from idam.evaluation.methods import METHODS, build_method, network, pipeline
 from idam.network.config import Config
 from idam.network.model import IDAM
-from idam.network.pretrained import save_model
+from idam.network.pretrained import load_model, save_model
 
 NETWORKS = {"gnn-idam": "gnn", "fpfh-idam": "fpfh"}
 
@@ -44,10 +44,10 @@ def test_an_unknown_method_is_answered_with_the_known_ones(name):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("place", METHODS.values(), ids=METHODS)
+@pytest.mark.parametrize("place", [place for place, _ in METHODS.values()], ids=METHODS)
 def test_every_name_leads_to_a_function(place):
     module, function = place.split(":")
-    assert callable(getattr(import_module(module), function))
+    assert callable(getattr(import_module(f"idam.evaluation.methods.{module}"), function))
 
 
 def test_the_network_s_own_rows_and_the_whole_of_register_are_there():
@@ -73,7 +73,7 @@ def test_the_weights_are_read_once_and_not_for_every_pair(weights, clouds):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_without_a_model_the_network_has_the_weights_for_unseen_shapes(name, monkeypatch):
     asked = []
-    monkeypatch.setattr(network, "load_model", asked.append)
+    monkeypatch.setattr(network, "load_model", lambda model: (asked.append(model), IDAM(Config()))[1])
     build_method(name)
     build_method(name, "another")
     assert asked == [f"{NETWORKS[name]}-unseen-shapes", "another"]
@@ -103,3 +103,27 @@ def test_the_register_row_is_register_with_nothing_set_but_the_model(model, expe
     ((args, options),) = calls
     assert [a is b for a, b in zip(args, clouds, strict=True)] == [True, True]
     assert options == {"model": expected}
+
+
+def test_the_paper_s_inference_is_a_row_whatever_the_model_s_own(tmp_path, seasoned, clouds, monkeypatch):
+    used = []
+    config = Config(neighbours=5, channels=8, keep=1 / 2, iterations=7, keep_again=(1.0,), soft_matches=True)
+    save_model(tmp_path / "own.safetensors", seasoned(IDAM(config), torch.float32), {})
+    monkeypatch.setattr(network, "load_model", lambda name: (used.append(load_model(name)), used[-1])[1])
+    build_method("gnn-idam-paper", str(tmp_path / "own.safetensors"))
+    paper = Config(neighbours=5, channels=8)
+    assert used[0].config == paper
+    assert (paper.iterations, paper.keep, paper.keep_again, paper.soft_matches) == (3, 1 / 6, (), False)
+
+
+def test_the_register_row_takes_no_settings():
+    with pytest.raises(InputError, match="voxel_size=1"):
+        build_method("register", None, ["voxel_size=1"])
+
+
+def test_only_the_network_s_rows_have_weights_of_their_own():
+    assert network.weights_for("gnn-idam", "unseen-shapes") == "gnn-unseen-shapes"
+    assert network.weights_for("gnn-idam-paper", "gaussian-noise") == "gnn-gaussian-noise"
+    assert network.weights_for("gnn-idam", "no such experiment") is None
+    assert network.weights_for("icp", "unseen-shapes") is None
+    assert network.weights_for("register", "unseen-shapes") is None

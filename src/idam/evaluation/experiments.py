@@ -1,71 +1,93 @@
-"""Running methods over pairs: the paper's experiments (section 4), or anyone's own pairs."""
+"""What methods are measured on: the paper's experiments (section 4), one closer to practice, or anyone's own pairs."""
 
 from __future__ import annotations
 
-import time
+import hashlib
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from idam.data.modelnet40 import experiment_shapes
 from idam.data.pairs import EXPERIMENTS, Pairs, experiment_noise, fixed_pairs
+from idam.data.practice import fixed_practice_pairs
 from idam.errors import InputError
-from idam.evaluation.methods import Method
-from idam.evaluation.metrics import Metrics, measure
 
-__all__ = ["TEST_SEED", "Row", "read_pairs", "run", "test_pairs"]
+__all__ = ["AXISYMMETRIC", "TABLES", "TEST_SEED", "TestSet", "read_pairs", "test_set"]
 
 TEST_SEED = 1
 """Of the test pairs: with the index, all that they depend on."""
 
+TABLES = (*EXPERIMENTS, "practice", "practice-any-rotation")
+"""The paper's experiments, and disjoint halves (:mod:`idam.data.practice`) turned to 45 degrees or in any way."""
+
+AXISYMMETRIC = (5, 6, 9, 10, 15, 19, 34, 37)
+"""Labels of bottle, bowl, cone, cup, flower_pot, lamp, tent and vase, whose turn about their axis no one can see."""
+
 
 @dataclass(frozen=True)
-class Row:
-    """One method on one set of pairs.
+class TestSet:
+    """Pairs to measure on.
 
     Attributes:
-        method: its name.
-        model: the weights it used, if it was given any by name.
-        metrics: its errors.
-        seconds_per_pair: median wall-clock time.
-        pairs: how many.
+        name: of the experiment, or of the file.
+        pairs: n of them.
+        checksum: of what they were drawn from, the same on every machine.
+        labels: of the shapes (n,), where they are ModelNet40's.
+        whole: the shapes without noise and cropping, in the source's frame (n, 1024, 3), where they are known.
     """
 
-    method: str
-    model: str | None
-    metrics: Metrics
-    seconds_per_pair: float
-    pairs: int
+    __test__ = False  # not a test of pytest's
 
-    def to_dict(self) -> dict[str, Any]:
-        """One flat record, for JSON."""
-        return {
-            "method": self.method,
-            "model": self.model,
-            "pairs": self.pairs,
-            **self.metrics.to_dict(),
-            "seconds_per_pair": self.seconds_per_pair,
-        }
+    name: str
+    pairs: Pairs
+    checksum: str
+    labels: Tensor | None = None
+    whole: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def first(self, count: int) -> TestSet:
+        """The first pairs alone."""
+        labels, whole = (None if part is None else part[:count] for part in (self.labels, self.whole))
+        return TestSet(self.name, self.pairs[:count], self.checksum, labels, whole)
+
+    @property
+    def observable(self) -> Tensor | None:
+        """Which pairs' rotation can be seen (n,): all but those of the axisymmetric categories."""
+        return None if self.labels is None else ~torch.isin(self.labels, torch.tensor(AXISYMMETRIC))
 
 
-def test_pairs(experiment: str, folder: str | Path) -> Pairs:
+def test_set(experiment: str, folder: str | Path) -> TestSet:
     """The test pairs of an experiment, the same on every machine.
 
     Raises:
         InputError: there is no such experiment, or the folder does not hold ModelNet40.
     """
-    if experiment not in EXPERIMENTS:
-        raise InputError(f"unknown experiment {experiment!r}: choose {', '.join(EXPERIMENTS)}")
+    if experiment not in TABLES:
+        raise InputError(f"unknown experiment {experiment!r}: choose {', '.join(TABLES)}")
     shapes = experiment_shapes(experiment, folder, "test")
-    return fixed_pairs(shapes.points, TEST_SEED, experiment_noise(experiment))
+    if experiment in EXPERIMENTS:
+        pairs = fixed_pairs(shapes.points, TEST_SEED, experiment_noise(experiment))
+    else:
+        any_rotation = experiment == "practice-any-rotation"
+        pairs = fixed_practice_pairs(shapes.points, TEST_SEED, any_rotation=any_rotation)
+    # of the shapes and the drawn translations: what a matrix product has made may differ in its last bit by machine
+    return TestSet(experiment, pairs, _checksum(shapes.points, pairs.translation), shapes.labels, shapes.points)
 
 
-def read_pairs(path: str | Path) -> Pairs:
+def _checksum(*tensors: Tensor) -> str:
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(np.ascontiguousarray(tensor.numpy()).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def read_pairs(path: str | Path) -> TestSet:
     """Pairs from an ``.npz`` with ``source`` (n, P, 3), ``target`` (n, Q, 3), ``R`` (n, 3, 3) and ``t`` (n, 3).
 
     Raises:
@@ -82,7 +104,7 @@ def read_pairs(path: str | Path) -> Pairs:
         raise InputError(f"{path}: {error.args[0]}; it needs the arrays source, target, R and t") from None
     except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read as .npz ({error})") from None
-    source, target, rotation, translation = arrays
+    source, target, rotation, _ = arrays
     count = len(source) if source.ndim == 3 else -1
     expected = [(count, source.shape[1] if source.ndim == 3 else 0, 3), (count, -1, 3), (count, 3, 3), (count, 3)]
     for name, array, shape in zip(("source", "target", "R", "t"), arrays, expected, strict=True):
@@ -97,25 +119,5 @@ def read_pairs(path: str | Path) -> Pairs:
         raise InputError(f"{path}: a pair needs 3 points of each cloud or more; give larger clouds")
     if np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation).min() < 0:
         raise InputError(f"{path}: R holds matrices that are no rotations; needed are orthogonal ones, determinant 1")
-    return Pairs(*(torch.from_numpy(array) for array in (source, target, rotation, translation)))
-
-
-def run(name: str, method: Method, pairs: Pairs, model: str | None, advance: Callable[[], None]) -> Row:
-    """Register every pair on its own, as a user would, and measure.
-
-    Args:
-        name: of the method, for the row.
-        method: what registers.
-        pairs: on the CPU.
-        model: the weights' name, for the row.
-        advance: called after each pair.
-    """
-    estimates, seconds = [], []
-    for source, target in zip(pairs.source.numpy(), pairs.target.numpy(), strict=True):
-        started = time.perf_counter()
-        estimates.append(method(source, target))
-        seconds.append(time.perf_counter() - started)
-        advance()
-    transformation = torch.from_numpy(np.stack(estimates))
-    metrics = measure(transformation[:, :3, :3], transformation[:, :3, 3], pairs.rotation, pairs.translation)
-    return Row(name, model, metrics, float(np.median(seconds)), len(pairs))
+    tensors = [torch.from_numpy(array) for array in arrays]
+    return TestSet(str(path), Pairs(*tensors), _checksum(*tensors))

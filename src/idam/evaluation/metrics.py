@@ -7,12 +7,15 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from idam.geometry import rotation_angle, rotation_to_euler_zyx
+from idam.data.pairs import Pairs
+from idam.geometry import apply_transform, nearest, rotation_angle, rotation_to_euler_zyx
 
-__all__ = ["Metrics", "measure"]
+__all__ = ["Metrics", "measure", "modified_chamfer"]
 
 RECALL_ANGLE = 5.0
 RECALL_DISTANCE = 0.05
+CHUNK = 64
+"""Pairs whose distance matrices are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class Metrics:
         rmse_t: root mean square error of the translation's coordinates.
         mae_t: mean absolute error of the translation's coordinates.
         recall: share of pairs within 5 degrees and 0.05.
+        angle: mean angle of R* R^T, degrees.
+        distance: mean of |t - t*|.
     """
 
     rmse_r: float
@@ -32,6 +37,8 @@ class Metrics:
     rmse_t: float
     mae_t: float
     recall: float
+    angle: float
+    distance: float
 
     def to_dict(self) -> dict[str, float]:
         """The figures by name."""
@@ -56,4 +63,31 @@ def measure(rotation: Tensor, translation: Tensor, true_rotation: Tensor, true_t
         rmse_t=float(offset.square().mean().sqrt()),
         mae_t=float(offset.abs().mean()),
         recall=float(right.to(torch.float64).mean()),
+        angle=float(turn.mean()),
+        distance=float(offset.norm(dim=-1).mean()),
     )
+
+
+def modified_chamfer(pairs: Pairs, whole: Tensor, rotation: Tensor, translation: Tensor) -> float:
+    """Mean modified Chamfer distance of n pairs: each cloud against the other's whole, clean shape.
+
+    mean_i min_q |R p_i + t - q|^2 + mean_j min_p |q_j - (R p + t)|^2, with q of the whole shape where it truly lies and
+    p of the whole shape where the source was (Yew and Lee, RPM-Net, CVPR 2020, section 5.1). Unlike the angle it
+    forgives a turn about an axis of symmetry.
+
+    Args:
+        pairs: n pairs.
+        whole: their shapes without noise and cropping, in the source's frame (n, W, 3).
+        rotation: estimates (n, 3, 3).
+        translation: estimates (n, 3).
+    """
+    rotation, translation = rotation.float(), translation.float()
+    total = 0.0
+    for start in range(0, len(pairs), CHUNK):
+        rows = slice(start, start + CHUNK)
+        chunk, move = pairs[rows], (rotation[rows], translation[rows])
+        true_whole = apply_transform(whole[rows], chunk.rotation, chunk.translation)
+        to_target, _ = nearest(apply_transform(chunk.source, *move), true_whole)
+        to_source, _ = nearest(chunk.target, apply_transform(whole[rows], *move))
+        total += float((to_target.mean(-1) + to_source.mean(-1)).sum())
+    return total / len(pairs)

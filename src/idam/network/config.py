@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
 
-from idam.errors import InputError
-
-__all__ = ["Config", "with_settings"]
+__all__ = ["Config"]
 
 
 @dataclass(frozen=True)
@@ -45,30 +41,3 @@ class Config:
     trusted: float = 0.9
     keep_matches: float = 0.5
     soft_matches: bool = False
-
-
-def with_settings(config: Config, settings: Iterable[str]) -> Config:
-    """The configuration with some fields set from text, each ``NAME=VALUE``; shares in ``keep_again`` by commas.
-
-    Raises:
-        InputError: no field has that name, or the value does not fit it.
-    """
-    defaults = {f.name: f.default for f in fields(Config)}
-    values: dict[str, Any] = {}
-    for setting in settings:
-        name, separator, text = setting.partition("=")
-        if name not in defaults or not separator:
-            raise InputError(f"unknown setting {setting!r}: give NAME=VALUE with one of {', '.join(defaults)}")
-        try:
-            values[name] = _parse(text, defaults[name])
-        except (ValueError, KeyError):
-            raise InputError(f"setting {setting!r}: {text!r} does not fit; the default is {defaults[name]!r}") from None
-    return replace(config, **values)
-
-
-def _parse(text: str, default: Any) -> Any:
-    if isinstance(default, bool):
-        return {"true": True, "false": False}[text.lower()]
-    if isinstance(default, tuple):
-        return tuple(float(share) for share in text.split(",") if share)
-    return type(default)(text)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
 import numpy as np
@@ -15,22 +15,46 @@ __all__ = ["METHODS", "Method", "build_method"]
 Method = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float64]]
 """Source (P, 3) and target (Q, 3) to the transform (4, 4) that lays the source on the target."""
 
-METHODS = {
-    "gnn-idam": "idam.evaluation.methods.network:gnn",
-    "fpfh-idam": "idam.evaluation.methods.network:fpfh",
-    "register": "idam.evaluation.methods.pipeline:build",
+PAPER = ("iterations=3", f"keep={1 / 6}", "keep_again=", "keep_matches=0.5", "soft_matches=false")
+"""The paper's inference, whatever a model's own."""
+
+METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "icp": ("classical:icp", ()),
+    "go-icp": ("go_icp:build", ()),
+    "fgr": ("classical:fgr", ()),
+    "fgr-tuned": ("classical:fgr", ("feature_radius=0.25", "fgr_distance=0.05")),
+    "fpfh-ransac": ("classical:ransac", ()),
+    "fpfh-ransac-tuned": ("classical:ransac", ()),
+    "fpfh-ransac-icp-tuned": ("classical:ransac", ("icp_after=0.05",)),
+    "kiss-matcher": ("kiss:build", ()),
+    "pointnetlk": ("pending:build", ()),
+    "dcp": ("pending:build", ()),
+    "prnet": ("pending:build", ()),
+    "fpfh-idam-paper": ("network:fpfh", PAPER),
+    "gnn-idam-paper": ("network:gnn", PAPER),
+    "fpfh-idam": ("network:fpfh", ()),
+    "gnn-idam": ("network:gnn", ()),
+    "register": ("pipeline:build", ()),
 }
-"""Where the function is that makes each method from the name of a model (or None for its own choice)."""
+"""The function that makes each method, in a module beside this one, and the settings of its row."""
 
 
-def build_method(name: str, model: str | None = None) -> Method:
+def build_method(name: str, model: str | None = None, settings: Sequence[str] = ()) -> Method:
     """The method of that name, with the named weights where it has any.
 
+    Args:
+        name: one of :data:`METHODS`.
+        model: name or file of weights; None for the method's own choice.
+        settings: of the method, each ``NAME=VALUE``, after those of its row.
+
     Raises:
-        InputError: no method has that name, or no model has that.
+        InputError: no method, model or setting has that name.
+        MissingDependencyError: what the method stands on is not installed, or the method is not there yet.
     """
     if name not in METHODS:
         raise InputError(f"unknown method {name!r}: choose {', '.join(METHODS)}")
-    module, function = METHODS[name].split(":")
-    method: Method = getattr(import_module(module), function)(model)
+    place, own = METHODS[name]
+    module, function = place.split(":")
+    build = getattr(import_module(f"{__name__}.{module}"), function)
+    method: Method = build(model, (*own, *settings))
     return method

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from idam.errors import InputError
 from idam.evaluation.methods import Method
-from idam.network.pretrained import load_model
+from idam.network.pretrained import list_models, load_model
+from idam.settings import with_settings
 
-__all__ = ["fpfh", "gnn"]
+__all__ = ["fpfh", "gnn", "weights_for"]
 
 
-def gnn(model: str | None) -> Method:
+def gnn(model: str | None, settings: Sequence[str]) -> Method:
     """The network on GNN features; ``gnn-unseen-shapes`` unless another model is named."""
-    return _alone(model or "gnn-unseen-shapes")
+    return _alone(model or "gnn-unseen-shapes", settings)
 
 
-def fpfh(model: str | None) -> Method:
+def fpfh(model: str | None, settings: Sequence[str]) -> Method:
     """The network on FPFH features; ``fpfh-unseen-shapes`` unless another model is named."""
-    return _alone(model or "fpfh-unseen-shapes")
+    return _alone(model or "fpfh-unseen-shapes", settings)
 
 
-def _alone(model: str) -> Method:
+def weights_for(method: str, experiment: str | None) -> str | None:
+    """The shipped weights trained for an experiment, where the method is the network alone and there are any."""
+    name = f"{method.split('-')[0]}-{experiment}"
+    return name if "-idam" in method and name in list_models() else None
+
+
+def _alone(model: str, settings: Sequence[str]) -> Method:
     network = load_model(model)
+    network.config = with_settings(network.config, settings)
 
     @torch.inference_mode()
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:

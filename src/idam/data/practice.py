@@ -1,0 +1,95 @@
+"""A protocol closer to practice than the paper's: two scans share a surface, but not one point of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from idam.data.pairs import MAX_ANGLE, MAX_TRANSLATION, NOISE, NOISE_CLIP, Pairs
+from idam.geometry import apply_transform, euler_xyz_to_rotation, gather_points, quaternion_to_rotation
+
+__all__ = ["KEPT", "fixed_practice_pairs", "make_practice_pairs"]
+
+KEPT = 0.7
+"""Share of each half that its half-space keeps."""
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """All that is random about B pairs."""
+
+    order: Tensor
+    direction: Tensor
+    noise: Tensor
+    angles: Tensor
+    quaternion: Tensor
+    translation: Tensor
+
+
+def make_practice_pairs(points: Tensor, generator: torch.Generator, *, any_rotation: bool) -> Pairs:
+    """Pairs from whole shapes (B, N, 3), drawn from ``generator`` as one batch.
+
+    Source and target are disjoint random halves of the shape's points, each cropped by a half-space of its own to 70 %
+    (the points lowest along a random direction), with noise N(0, 0.01), clipped to +-0.05, on every coordinate; the
+    rotation is R = Rx Ry Rz with angles from U[0, 45] degrees, or uniform over SO(3); t from U[-0.5, 0.5]^3.
+
+    Args:
+        points: whole shapes (B, N, 3).
+        generator: on the CPU.
+        any_rotation: all of SO(3).
+    """
+    return _build(points, _draw(len(points), points.shape[1], generator), any_rotation)
+
+
+def fixed_practice_pairs(points: Tensor, seed: int, *, any_rotation: bool) -> Pairs:
+    """Test pairs from whole shapes (B, N, 3): each depends on the seed and its index alone."""
+    draws = []
+    for index in range(len(points)):
+        draws.append(_draw(1, points.shape[1], torch.Generator().manual_seed(seed * 1_000_003 + index)))
+    drawn = _Draw(*(torch.cat([getattr(draw, field.name) for draw in draws]) for field in fields(_Draw)))
+    return _build(points, drawn, any_rotation)
+
+
+def _draw(count: int, points: int, generator: torch.Generator) -> _Draw:
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    return _Draw(
+        order=uniform(count, points).argsort(-1),
+        direction=normal(count, 2, 3),
+        noise=(normal(count, 2, _kept(points), 3) * NOISE).clamp_(-NOISE_CLIP, NOISE_CLIP),
+        angles=uniform(count, 3) * MAX_ANGLE,
+        quaternion=normal(count, 4),
+        translation=(uniform(count, 3) * 2 - 1) * MAX_TRANSLATION,
+    )
+
+
+def _kept(points: int) -> int:
+    return math.floor(KEPT * (points // 2))
+
+
+def _build(points: Tensor, draw: _Draw, any_rotation: bool) -> Pairs:
+    rotation = quaternion_to_rotation(draw.quaternion) if any_rotation else euler_xyz_to_rotation(draw.angles)
+    half = points.shape[1] // 2
+    source, target = (
+        _cropped(gather_points(points, order), direction, _kept(points.shape[1])) + noise
+        for order, direction, noise in zip(
+            (draw.order[:, :half], draw.order[:, half : 2 * half]),
+            draw.direction.unbind(1),
+            draw.noise.unbind(1),
+            strict=True,
+        )
+    )
+    return Pairs(source, apply_transform(target, rotation, draw.translation), rotation, draw.translation)
+
+
+def _cropped(points: Tensor, direction: Tensor, count: int) -> Tensor:
+    """The points (B, count, 3) of (B, N, 3) that lie lowest along one direction each (B, 3), in their own order."""
+    along = (points @ direction.unsqueeze(-1)).squeeze(-1)
+    return gather_points(points, along.topk(count, largest=False).indices.sort(-1).values)
