@@ -24,7 +24,7 @@ def rigid(degrees: float = 0.0, shift: float = 0.0) -> np.ndarray:
 
 def answer(transformation: np.ndarray, overlap: float = 0.0, votes: int = 1) -> Answer:
     nothing = Matches(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    return Answer(transformation, Hypothesis(transformation, nothing, 0.5), overlap, votes)
+    return Answer(transformation, Hypothesis(transformation, nothing), overlap, votes)
 
 
 # --- like answers --------------------------------------------------------------------------------------------------

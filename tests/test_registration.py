@@ -309,7 +309,7 @@ def test_refinements(refine: str) -> None:
 def test_last_refinement_takes_the_fine_clouds(method: str) -> None:
     fine = Level(SOURCE - CENTRE, bracket(2000, seed=2) - CENTRE, spacing=0.05)
     start = rigid(Rotation.from_rotvec([0.04, -0.03, 0.02]), [0.01, 0.0, -0.02])
-    answer = Answer(start, Hypothesis(start, Matches(*np.empty((3, 0))), 0.0))
+    answer = Answer(start, Hypothesis(start, Matches(*np.empty((3, 0)))))
     found, information = finish(answer, fine, method)
     assert degrees(found, np.eye(4)) < 1.5 < degrees(start, np.eye(4))
     assert np.linalg.norm(found[:3, 3]) < 0.01

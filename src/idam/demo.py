@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from idam.errors import InputError
-from idam.io import read_point_cloud, write_point_cloud, write_transform
+from idam.io import make_folder, read_point_cloud, write_point_cloud, write_transform
 from idam.registration import register
 from idam.report import write_report
 from idam.result import RegistrationResult
@@ -20,10 +19,7 @@ def run(output: Path) -> tuple[RegistrationResult, dict[str, Path]]:
     Raises:
         InputError: the folder cannot be made or written.
     """
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{output}: cannot make this folder ({error.strerror}); choose another --output") from None
+    make_folder(output)
     folder = resources.files("idam") / "data" / "demo"
     with resources.as_file(folder / "source.ply") as source, resources.as_file(folder / "target.ply") as target:
         clouds = read_point_cloud(source), read_point_cloud(target)

@@ -19,17 +19,15 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A candidate transform (4, 4) in working coordinates, the matches it came from, and how valid they seemed.
+    """A candidate transform (4, 4) in working coordinates, and the matches it came from.
 
     Attributes:
         transformation: working source to working target.
         matches: in working coordinates.
-        validity: mean validity of the matches that kept a weight.
     """
 
     transformation: Points
     matches: Matches
-    validity: float
 
 
 def starting_rotations(count: int, seed: int) -> torch.Tensor:
@@ -88,7 +86,7 @@ def _run(network: IDAM, source: KeyPoints, target: KeyPoints, starts: torch.Tens
         transformation[:3, :3] = nearest_rotation(rotation[n].double().cpu().numpy())
         transformation[:3, 3] = translation[n].double().cpu().numpy()
         matches = Matches(*(x[n].double().cpu().numpy() for x in (keys, last.match, last.weight)))
-        hypotheses.append(Hypothesis(transformation, matches, float(output.trust[n])))
+        hypotheses.append(Hypothesis(transformation, matches))
     return hypotheses
 
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from idam.confidence import Evidence, confidence
 from idam.errors import InputError
 from idam.hypotheses import nearest_rotation, propose, starting_rotations
-from idam.io import as_point_cloud
+from idam.io import as_point_cloud, rigid_fault
 from idam.network.model import IDAM
 from idam.network.pretrained import DEFAULT, find, load_model
 from idam.preprocess import (
@@ -161,17 +161,10 @@ def as_rigid(init: ArrayLike) -> Points:
         matrix = np.asarray(init, np.float64)
     except (TypeError, ValueError):
         raise InputError("init must be a 4x4 matrix of numbers") from None
-    if matrix.shape != (4, 4):
-        raise InputError(f"init must be a 4x4 matrix, not of shape {matrix.shape}")
-    rotation = matrix[:3, :3]
-    rigid = (
-        np.abs(rotation).max() < 2
-        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-        and np.linalg.det(rotation) > 0
-    )
-    if not (np.isfinite(matrix).all() and rigid and np.allclose(matrix[3], [0, 0, 0, 1])):
-        raise InputError("init is not a rigid transform: it needs a rotation, a translation and a last row 0 0 0 1")
-    return np.block([[nearest_rotation(rotation), matrix[:3, 3:]], [0.0, 0.0, 0.0, 1.0]])
+    fault = rigid_fault(matrix)
+    if fault:
+        raise InputError(f"init is not a rigid transform: {fault}")
+    return np.block([[nearest_rotation(matrix[:3, :3]), matrix[:3, 3:]], [0.0, 0.0, 0.0, 1.0]])
 
 
 @lru_cache(4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -20,11 +21,11 @@ from idam.data.pairs import EXPERIMENTS, Pairs, experiment_noise, fixed_pairs, m
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.geometry import apply_transform, gather_points
-from idam.io.files import one_line
+from idam.io.files import make_folder, one_line, write_bytes
 from idam.memory import keep_freed_memory
 from idam.network.config import Config
-from idam.network.elimination import keep_most_significant
-from idam.network.model import IDAM, KeyPoints
+from idam.network.elimination import keep_most_significant, share_of
+from idam.network.model import IDAM
 from idam.network.pretrained import load_model, save_model
 from idam.network.sampling import balanced_sample
 from idam.network.supervision import Loss, mutual_supervision
@@ -114,30 +115,34 @@ class SupervisedStep(nn.Module):
         # Fabric's own autocast would round the coordinates on the way in, and the labels need them exact as well
         with torch.autocast(batch.source.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             source_features, target_features = self.model.encode(batch.source, batch.target)
-            source = self._sample(batch.source, source_features, batch.source_index)
-            target = self._sample(batch.target, target_features, batch.target_index, all_eliminated=True)
+            source_significance = self.model.significance(source_features)
+            target_significance = self.model.significance(target_features)
+            source_index, target_index = batch.source_index, batch.target_index
+            if self.recipe.eliminate:
+                source_kept, target_index = (
+                    keep_most_significant(significance.detach(), self.model.config.keep)
+                    for significance in (source_significance, target_significance)
+                )
+                # drawn samples come positives first: every second one keeps the balance
+                source_index = torch.cat([source_index[:, ::2], source_kept[:, : source_index.shape[1] // 2]], 1)
+            source, target = gather_points(batch.source, source_index), gather_points(batch.target, target_index)
             iterations = self.model.iterate(
-                source.points, target.points, source.features, target.features, self.recipe.iterations
+                source,
+                target,
+                gather_points(source_features, source_index),
+                gather_points(target_features, target_index),
+                self.recipe.iterations,
             )
         return mutual_supervision(
             iterations,
-            source.points,
-            target.points,
+            source,
+            target,
             batch.rotation,
             batch.translation,
-            source.significance.gather(1, source.index),
-            target.significance.gather(1, target.index),
+            source_significance.gather(1, source_index),
+            target_significance.gather(1, target_index),
             self.recipe.radius,
         )
-
-    def _sample(self, points: Tensor, features: Tensor, index: Tensor, *, all_eliminated: bool = False) -> KeyPoints:
-        significance = self.model.significance(features)
-        if self.recipe.eliminate:
-            kept = keep_most_significant(significance.detach(), self.model.config.keep)
-            half = index.shape[1] // 2
-            # balanced samples come positives first: every second one keeps the balance
-            index = kept if all_eliminated else torch.cat([index[:, ::2], kept[:, :half]], 1)
-        return KeyPoints(gather_points(points, index), gather_points(features, index), index, significance)
 
 
 @torch.inference_mode()
@@ -172,7 +177,7 @@ def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -
     generator = torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
     pairs = make_pairs(shapes.points[rows], generator, recipe.sigma)
     aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
-    count = math.ceil(recipe.keep * pairs.source.shape[1] - 1e-9)
+    count = share_of(pairs.source.shape[1], recipe.keep)
     source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)
     return Batch(pairs.source, pairs.target, pairs.rotation, pairs.translation, source_index, target_index)
 
@@ -225,7 +230,7 @@ def train(
         ) from error
     check(recipe)
     check_run(device, precision, validate_every)
-    output = prepare_folder(Path(output))
+    output = make_folder(output)
     keep_freed_memory()
     fabric = Fabric(
         accelerator=device,
@@ -278,8 +283,6 @@ def check(recipe: Recipe) -> None:
         raise InputError(f"unknown experiment {recipe.experiment!r}: choose {', '.join(EXPERIMENTS)}")
     if recipe.schedule not in ("step", "one-cycle"):
         raise InputError(f"unknown schedule {recipe.schedule!r}: choose step or one-cycle")
-    if recipe.config.features not in ("gnn", "fpfh"):
-        raise InputError(f"unknown features {recipe.config.features!r}: choose gnn or fpfh")
     positive = (recipe.epochs, recipe.learning_rate, recipe.radius)
     if not all(0 < value < math.inf for value in positive) or recipe.batch_size < 2:
         raise InputError("epochs, the learning rate and the radius must be positive, and the batch at least 2 pairs")
@@ -332,17 +335,6 @@ def initial_model(recipe: Recipe) -> IDAM:
     return model
 
 
-def prepare_folder(folder: Path) -> Path:
-    """Make the output folder; raise InputError where it cannot be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot make this folder ({error.strerror}); choose another --output") from None
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"{folder}: this folder is read-only; choose another --output")
-    return folder
-
-
 def history(recipe: Recipe, progress: Progress, scores: Metrics, pairs: int, command: str) -> dict[str, Any]:
     """The provenance of a model: what it was trained on, how far, and how it did on the validation pairs."""
     return {
@@ -387,16 +379,9 @@ def save_checkpoint(
         "progress": asdict(progress),
         "recipe": json.dumps(asdict(recipe)),
     }
-    partial = path.with_suffix(".tmp")
-    try:
-        torch.save(state, partial)
-        partial.replace(path)
-    except (OSError, RuntimeError) as error:  # torch turns some of the system's errors into its own
-        raise InputError(
-            f"{path}: cannot be written ({one_line(error)}); make room or choose another --output"
-        ) from None
-    finally:
-        partial.unlink(missing_ok=True)
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    write_bytes(path, buffer.getvalue())
 
 
 def restore(path: Path, module: SupervisedStep, optimizer: torch.optim.Optimizer, recipe: Recipe) -> Progress:
@@ -462,7 +447,9 @@ class Log:
 
     def validation(self, step: int, scores: Metrics) -> None:
         """Show the errors on the validation pairs."""
-        self.bar.console.print(f"step {step + 1}: " + " ".join(f"{k} {v:.4f}" for k, v in scores.to_dict().items()))
+        self.bar.console.print(
+            f"step {step + 1}: " + " ".join(f"{k} {v:.4f}" for k, v in scores.to_dict().items()), soft_wrap=True
+        )
         if self.writer is not None:
             for name, value in scores.to_dict().items():
                 self.writer.add_scalar(f"validation/{name}", value, step)

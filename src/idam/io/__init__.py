@@ -6,9 +6,9 @@ file and says what to do. Every write is atomic: a failed one leaves the old fil
 
 from idam.io.cloud import PointCloud
 from idam.io.convert import as_point_cloud
-from idam.io.files import check_destination, write_json, write_text
+from idam.io.files import check_destination, make_folder, write_json, write_text
 from idam.io.formats import check_writable, read_point_cloud, write_point_cloud
-from idam.io.transforms import format_transform, read_transform, write_transform
+from idam.io.transforms import format_transform, read_transform, rigid_fault, write_transform
 
 __all__ = [
     "PointCloud",
@@ -16,8 +16,10 @@ __all__ = [
     "check_destination",
     "check_writable",
     "format_transform",
+    "make_folder",
     "read_point_cloud",
     "read_transform",
+    "rigid_fault",
     "write_json",
     "write_point_cloud",
     "write_text",

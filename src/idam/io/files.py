@@ -22,6 +22,7 @@ __all__ = [
     "StrPath",
     "check_destination",
     "check_unpacked_size",
+    "make_folder",
     "one_line",
     "read_bytes",
     "silenced",
@@ -94,6 +95,22 @@ def check_destination(path: StrPath) -> Path:
             raise
         raise InputError(f"{path}: cannot be written ({one_line(error)}): write to another folder") from error
     return target
+
+
+def make_folder(path: StrPath) -> Path:
+    """Make a folder to write to, with those above it, unless it is there.
+
+    Raises:
+        InputError: it cannot be made, or not be written.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot make this folder ({one_line(error)}): choose another") from None
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{path}: this folder is write-protected: choose another")
+    return folder
 
 
 def _replace(target: Path, data: bytes) -> None:

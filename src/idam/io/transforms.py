@@ -15,7 +15,7 @@ from idam.errors import InputError
 from idam.io.arrays import parse_npy
 from idam.io.files import StrPath, one_line, read_bytes, write_bytes, write_json, write_text
 
-__all__ = ["format_transform", "read_transform", "write_transform"]
+__all__ = ["format_transform", "read_transform", "rigid_fault", "write_transform"]
 
 _LARGEST = 2**20  # bytes: a result of register() takes a few thousand
 
@@ -34,7 +34,7 @@ def read_transform(path: StrPath) -> NDArray[np.float64]:
             matrix = _DECODERS.get(Path(path).suffix.lower(), _decode_text)(data)
     except Exception as error:  # there is no telling what parsers throw at a damaged file
         raise InputError(f"{path}: holds no 4 x 4 transform ({one_line(error)}): save 4 lines of 4 numbers") from error
-    fault = _fault(matrix)
+    fault = rigid_fault(matrix)
     if fault:
         raise InputError(f"{path}: is not a rigid transform: {fault}")
     return matrix
@@ -87,8 +87,8 @@ def _decode_text(data: bytes) -> NDArray[np.float64]:
 _DECODERS = {".json": _decode_json, ".npy": _decode_npy}
 
 
-def _fault(matrix: NDArray[np.float64]) -> str:
-    """Say what keeps a matrix from being a rigid transform, and how to mend it; empty if nothing does."""
+def rigid_fault(matrix: NDArray[np.float64]) -> str:
+    """Say what keeps a matrix (4, 4) from being a rigid transform, and how to mend it; empty if nothing does."""
     if matrix.shape != (4, 4):
         return f"expected shape (4, 4), got {matrix.shape}"
     if not np.isfinite(matrix).all():

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from idam.network.layers import NormalisedLinear
 
-__all__ = ["Significance", "Validity", "hybrid_weights", "keep_most_significant"]
+__all__ = ["Significance", "Validity", "hybrid_weights", "keep_most_significant", "share_of"]
 
 
 class Significance(nn.Module):
@@ -40,9 +40,12 @@ def keep_most_significant(significance: Tensor, keep: float) -> Tensor:
     Never fewer than three points, which a rigid transform needs.
     """
     count = significance.shape[-1]
-    # the small slack keeps ceil(N / 6) exact where keep * N is an integer up to rounding
-    kept = min(count, max(3, math.ceil(keep * count - 1e-9)))
-    return significance.topk(kept, dim=-1).indices
+    return significance.topk(min(count, max(3, share_of(count, keep))), dim=-1).indices
+
+
+def share_of(count: int, share: float) -> int:
+    """ceil(share count), exact where the product is an integer up to rounding, as it is for N / 6."""
+    return math.ceil(share * count - 1e-9)
 
 
 class Validity(nn.Module):

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from idam.errors import InputError
+from idam.io.files import write_bytes
 from idam.network.config import Config
 from idam.network.model import IDAM
 
@@ -74,15 +75,7 @@ def save_model(path: Path, model: IDAM, provenance: dict[str, Any]) -> None:
     """
     state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
     metadata = {"config": json.dumps(asdict(model.config)), "provenance": json.dumps(provenance)}
-    try:
-        partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            partial.write_bytes(save(state, metadata))
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
+    write_bytes(path, save(state, metadata))
 
 
 def find(name: str | os.PathLike[str]) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from idam.errors import InputError
 from idam.network.features.fpfh import FPFH
 from idam.network.features.gnn import GNN
 
@@ -17,10 +18,10 @@ def build_features(config: Config) -> GNN | FPFH:
     """The feature extractor that a configuration names.
 
     Raises:
-        ValueError: the name is unknown.
+        InputError: the name is unknown.
     """
     if config.features == "gnn":
         return GNN(config.neighbours)
     if config.features == "fpfh":
         return FPFH(normal_radius=config.normal_radius, feature_radius=config.feature_radius)
-    raise ValueError(f"unknown features {config.features!r}: choose 'gnn' or 'fpfh'")
+    raise InputError(f"unknown features {config.features!r}: choose gnn or fpfh")
