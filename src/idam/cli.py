@@ -180,7 +180,9 @@ def train(
     batch_size: Annotated[int, typer.Option(help="Pairs a step, over all processes.")] = 16,
     schedule: Annotated[str, typer.Option(help="step (the paper's) or one-cycle.")] = "step",
     learning_rate: Annotated[float, typer.Option(help="Adam's, at its highest.")] = 1e-4,
-    start: Annotated[str | None, typer.Option(help="Name or file of a model whose weights to start from.")] = None,
+    start: Annotated[
+        str | None, typer.Option(help="Name or file of a model, or a last.ckpt, whose weights to start from.")
+    ] = None,
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
     ] = False,

@@ -55,7 +55,7 @@ class Recipe:
         iterations: iterations of a training step; the configuration's are those after training.
         eliminate: let hard elimination choose the target points, and half of the source points, as it does after
             training; balanced sampling chooses the other half.
-        start: name or file of a model whose weights to start from; None for random ones.
+        start: name or file of a model, or a ``last.ckpt``, whose weights to start from; None for random ones.
         seed: of the weights, pairs and samples.
     """
 
@@ -326,8 +326,10 @@ def initial_model(recipe: Recipe) -> IDAM:
     """The network to train, with random weights or those to start from; raise InputError where those do not fit."""
     model = IDAM(recipe.config)
     if recipe.start is not None:
+        checkpoint = Path(recipe.start).suffix == ".ckpt"
+        state = read_checkpoint(Path(recipe.start))["model"] if checkpoint else load_model(recipe.start).state_dict()
         try:
-            model.load_state_dict(load_model(recipe.start).state_dict())
+            model.load_state_dict(state)
         except RuntimeError:
             raise InputError(
                 f"{recipe.start}: has another architecture; start from a model with the same options"
@@ -388,17 +390,23 @@ def restore(path: Path, module: SupervisedStep, optimizer: torch.optim.Optimizer
     """Load a checkpoint, if there is one; raise InputError where it is another recipe's."""
     if not path.is_file():
         return Progress()
+    state = read_checkpoint(path)
+    if json.loads(state["recipe"]) != json.loads(json.dumps(asdict(recipe))):
+        raise InputError(f"{path}: was trained with other options; give the same ones, or another --output")
+    module.model.load_state_dict(state["model"])
+    optimizer.load_state_dict(state["optimizer"])
+    return Progress(**state["progress"])
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What :func:`save_checkpoint` wrote; raise InputError where the file is something else."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        if json.loads(state["recipe"]) == json.loads(json.dumps(asdict(recipe))):
-            module.model.load_state_dict(state["model"])
-            optimizer.load_state_dict(state["optimizer"])
-            return Progress(**state["progress"])
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, EOFError, UnpicklingError) as error:
-        raise InputError(
-            f"{path}: not a checkpoint of idam ({one_line(error)}); start again without --resume"
-        ) from None
-    raise InputError(f"{path}: was trained with other options; give the same ones, or another --output")
+        if not {"model", "optimizer", "progress", "recipe"} <= state.keys():
+            raise ValueError("parts are missing")
+    except (OSError, RuntimeError, AttributeError, ValueError, EOFError, UnpicklingError) as error:
+        raise InputError(f"{path}: not a checkpoint of idam ({one_line(error)}); start again without it") from None
+    return dict(state)
 
 
 class Log:
