@@ -91,7 +91,7 @@ def test_a_model_file_is_as_readable_as_any_other_file(path):
 
 
 def test_saving_into_a_missing_folder_says_so(tmp_path, model):
-    with pytest.raises(InputError, match="there is no folder .*nowhere"):
+    with pytest.raises(InputError, match=r"there is no folder .*nowhere"):
         save_model(tmp_path / "nowhere" / "small.safetensors", model, {})
 
 

@@ -27,6 +27,9 @@ class Config:
         keep_matches: share of matches that hybrid elimination keeps.
         soft_matches: match a point to its row's expectation (the mean of the target, weighted by similarity) rather
             than to the row's best target point.
+        convolution: score pairs by the similarity matrix convolution; without it, by features' inner products.
+        hard_elimination: keep the most significant points; without it, random ones.
+        hybrid_elimination: weigh matches by their validity; without it, all alike.
     """
 
     features: str = "gnn"
@@ -41,3 +44,6 @@ class Config:
     trusted: float = 0.9
     keep_matches: float = 0.5
     soft_matches: bool = False
+    convolution: bool = True
+    hard_elimination: bool = True
+    hybrid_elimination: bool = True

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from idam.geometry import apply_transform, compose, gather_points, weighted_procrustes
+from idam.network.ablation import EqualValidity, InnerProduct, RandomSignificance
 from idam.network.config import Config
 from idam.network.elimination import Significance, Validity, hybrid_weights, keep_most_significant
 from idam.network.features import build_features
@@ -99,12 +100,15 @@ class IDAM(nn.Module):
         super().__init__()
         self.config = config or Config()
         self.features = build_features(self.config)
-        channels = self.features.channels
-        self.significance = Significance(channels, self.config.channels)
+        inputs, channels, blocks = self.features.channels, self.config.channels, range(self.config.blocks)
+        self.significance = Significance(inputs, channels) if self.config.hard_elimination else RandomSignificance()
         self.similarity = nn.ModuleList(
-            SimilarityConvolution(channels, self.config.channels) for _ in range(self.config.blocks)
+            SimilarityConvolution(inputs, channels) if self.config.convolution else InnerProduct(channels)
+            for _ in blocks
         )
-        self.validity = nn.ModuleList(Validity(self.config.channels) for _ in range(self.config.blocks))
+        self.validity = nn.ModuleList(
+            Validity(channels) if self.config.hybrid_elimination else EqualValidity() for _ in blocks
+        )
 
     def forward(self, source: Tensor, target: Tensor) -> Output:
         """Register batches of clouds: the transform that lays each source on its target (figure 2).
