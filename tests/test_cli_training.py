@@ -22,7 +22,10 @@ from idam.evaluation import experiments
 from idam.evaluation.experiments import TestSet
 from idam.evaluation.runner import Task, run
 from idam.network.pretrained import list_models, load_model, provenance
-from idam.training import Recipe, SupervisedStep, batch_at, initial_model, split_validation
+from idam.training import Recipe, loop
+from idam.training.batches import batch_at, split_validation
+from idam.training.checkpoint import initial_model
+from idam.training.step import SupervisedStep
 
 
 class Outcome(NamedTuple):
@@ -36,7 +39,7 @@ class Outcome(NamedTuple):
 @pytest.fixture
 def idam(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
     """Runs a command in this process."""
-    monkeypatch.setattr(training, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
+    monkeypatch.setattr(loop, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
 
     def run(*words: object) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["idam", *map(str, words)])
@@ -145,9 +148,9 @@ def test_train_leaves_a_model_that_can_be_used(features, idam, trainable, tmp_pa
 
 
 def test_unseen_categories_are_not_trained_on(idam, trainable, tmp_path, monkeypatch):
-    labels, split = [], training.split_validation
+    labels, split = [], loop.split_validation
     monkeypatch.setattr(
-        training, "split_validation", lambda shapes, *args: (labels.extend(shapes.labels), split(shapes, *args))[1]
+        loop, "split_validation", lambda shapes, *args: (labels.extend(shapes.labels), split(shapes, *args))[1]
     )
     assert idam("train", "unseen-categories", "--data", trainable, "-o", tmp_path / "run", *FEW_STEPS).code == 0
     assert len(labels) == 11
@@ -212,7 +215,7 @@ def one_thread():
 def on_averaged_gradients(recipe: Recipe, data: Path, steps: int) -> dict[str, torch.Tensor]:
     """Weights after some steps with the mean of the gradients that two processes see."""
     torch.manual_seed(recipe.seed)
-    shapes, _ = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe.seed, recipe.sigma)
+    shapes, _ = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe)
     module = SupervisedStep(initial_model(recipe), recipe, "32")
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     for step in range(steps):

@@ -17,18 +17,23 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from idam import training
 from idam.data import pairs as protocol
+from idam.data.general import POINTS
 from idam.data.modelnet40 import Shapes
-from idam.data.pairs import Pairs, experiment_noise
+from idam.data.pairs import Pairs
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
-from idam.geometry import apply_transform
+from idam.geometry import apply_transform, rotation_angle
 from idam.network.config import Config
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model, provenance, save_model
 from idam.network.supervision import Loss
-from idam.training import Batch, Recipe, SupervisedStep, batch_at, split_validation, train, validate
+from idam.training import TRAININGS, Recipe, loop, train
+from idam.training import checkpoint as saving
+from idam.training.batches import Batch, batch_at, split_validation
+from idam.training.checkpoint import initial_model
+from idam.training.loop import validate
+from idam.training.step import SupervisedStep
 
 SMALL = Recipe(
     config=Config(neighbours=6, channels=8),
@@ -62,14 +67,14 @@ def fit(monkeypatch: pytest.MonkeyPatch, shapes: Shapes) -> Callable[..., list[L
     """Trains on the small shapes, stopped by Ctrl-C after a step if asked to, and returns the loss of every step."""
     pytest.importorskip("lightning_fabric", reason="training needs Lightning Fabric")
     pytest.importorskip("tensorboard", reason="training needs TensorBoard")
-    monkeypatch.setattr(training, "experiment_shapes", lambda *_: shapes)
-    monkeypatch.setattr(training, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
+    monkeypatch.setattr(loop, "experiment_shapes", lambda *_: shapes)
+    monkeypatch.setattr(loop, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
     monkeypatch.setattr(protocol, "CROPPED_POINTS", 96)
 
     def run(recipe: Recipe, output: Path, *, stop_after: int | None = None, **options: Any) -> list[Loss]:
         losses = []
 
-        class WatchedLog(training.Log):
+        class WatchedLog(loop.Log):
             def step(self, step: int, loss: Loss) -> None:
                 super().step(step, loss)
                 losses.append(Loss(*(part.detach() for part in loss)))
@@ -77,7 +82,7 @@ def fit(monkeypatch: pytest.MonkeyPatch, shapes: Shapes) -> Callable[..., list[L
                     raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(training, "Log", WatchedLog)
+            patch.setattr(loop, "Log", WatchedLog)
             best = train(recipe, "not read", output, **({"device": "cpu"} | options))
         assert best == output / "best.safetensors"
         return losses
@@ -160,7 +165,7 @@ def owner(points: Tensor, shapes: Shapes) -> list[int]:
 
 
 def test_validation_pairs_are_of_shapes_that_are_not_trained_on(shapes):
-    train_shapes, pairs = split_validation(shapes, 0, 0.0)
+    train_shapes, pairs = split_validation(shapes, SMALL)
     assert len(train_shapes) == 36
     assert len(pairs) == 4
     assert sorted(owner(source, shapes)[0] for source in pairs.source) == sorted(held_out(train_shapes))
@@ -170,22 +175,40 @@ def test_validation_pairs_are_of_shapes_that_are_not_trained_on(shapes):
 
 def test_200_shapes_validate_where_there_are_many():
     many = Shapes(torch.rand(2500, 4, 3), torch.arange(2500))
-    train_shapes, pairs = split_validation(many, 0, 0.0)
+    train_shapes, pairs = split_validation(many, SMALL)
     assert (len(train_shapes), len(pairs)) == (2300, 200)
 
 
 def test_the_split_depends_on_the_seed_alone(shapes):
-    first, pairs = split_validation(shapes, 3, 0.0)
+    first, pairs = split_validation(shapes, changed(seed=3))
     torch.rand(1)
-    again, same_pairs = split_validation(shapes, 3, 0.0)
+    again, same_pairs = split_validation(shapes, changed(seed=3))
     assert torch.equal(first.labels, again.labels)
     assert torch.equal(pairs.source, same_pairs.source)
     assert torch.equal(pairs.rotation, same_pairs.rotation)
-    assert held_out(split_validation(shapes, 4, 0.0)[0]) != held_out(first)
+    assert held_out(split_validation(shapes, changed(seed=4))[0]) != held_out(first)
+
+
+@pytest.mark.parametrize("features", ["gnn", "fpfh"])
+def test_general_pairs_are_drawn_as_far_apart_as_the_features_can_take(features, shapes):
+    recipe = changed(experiment="general", config=Config(features=features))
+    train_shapes, validation = split_validation(shapes, recipe)
+    batches = [batch_at(train_shapes, recipe, step, 0, 1) for step in range(12)]
+    angles = rotation_angle(torch.cat([validation.rotation, *(batch.rotation for batch in batches)])).rad2deg()
+    assert (angles.max() > 90) == (features == "fpfh")
+    assert validation.source.shape == validation.target.shape == (4, POINTS, 3)
+    assert torch.equal(batches[3].source, batch_at(train_shapes, recipe, 3, 0, 1).source)
+    assert not torch.equal(batches[3].source, batches[4].source)
+
+
+def test_noise_of_one_s_own_takes_the_place_of_the_experiment_s(shapes):
+    for experiment, noise, exact in (("gaussian-noise", 0.0, True), ("unseen-shapes", 0.01, False)):
+        _, pairs = split_validation(shapes, changed(experiment=experiment, noise=noise))
+        assert all((owner(source, shapes) != []) == exact for source in pairs.source)
 
 
 def test_validation_pairs_have_the_experiment_s_noise(shapes):
-    _, pairs = split_validation(shapes, 0, experiment_noise("gaussian-noise"))
+    _, pairs = split_validation(shapes, changed(experiment="gaussian-noise"))
     assert all(owner(source, shapes) == [] for source in pairs.source)
 
 
@@ -334,14 +357,14 @@ def test_the_best_model_tells_how_it_came_about(fit, tmp_path, shapes):
     assert told["torch"] == torch.__version__
     assert told["training_seconds"] >= 0
     assert told["validation_pairs"].startswith("4 ")
-    _, pairs = split_validation(shapes, 5, experiment_noise("gaussian-noise"))
+    _, pairs = split_validation(shapes, recipe)
     assert told["validation"] == pytest.approx(validate(model, pairs).to_dict(), abs=1e-5)
 
 
 def test_the_provenance_has_the_commit_of_idam_s_checkout(fit, tmp_path):
     fit(SMALL, tmp_path)
     commit = provenance(tmp_path / "best.safetensors")["commit"]
-    root = Path(training.__file__).parents[2]
+    root = Path(saving.__file__).parents[3]
     if not (root / ".git").exists():
         assert commit == ""
     else:
@@ -359,9 +382,9 @@ def test_installed_below_another_checkout_idam_does_not_take_its_commit(tmp_path
     subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "another project"], check=True)
     package = tmp_path / "site-packages" / "idam"
     package.mkdir(parents=True)
-    (package / "training.py").touch()
-    monkeypatch.setattr(training, "__file__", str(package / "training.py"))
-    assert training.commit() == ""
+    (package / "checkpoint.py").touch()
+    monkeypatch.setattr(saving, "__file__", str(package / "checkpoint.py"))
+    assert saving.commit() == ""
 
 
 def test_the_log_has_the_parts_of_the_loss_and_the_validation(fit, tmp_path):
@@ -392,7 +415,7 @@ def test_the_checkpoint_with_the_least_rotation_error_is_kept(fit, tmp_path, mon
         seen.append((pairs, {name: value.clone() for name, value in model.state_dict().items()}))
         return Metrics(9, next(errors), 9, 9, 0, 9, 9)
 
-    monkeypatch.setattr(training, "validate", scripted)
+    monkeypatch.setattr(loop, "validate", scripted)
     fit(SMALL, tmp_path, validate_every=3)
     best = tmp_path / "best.safetensors"
     assert provenance(best)["steps"] == 6
@@ -416,7 +439,7 @@ def test_bfloat16_trains_to_finite_weights_in_single_precision(fit, tmp_path):
 
 def test_validation_is_the_network_on_each_pair_alone(shapes, seasoned):
     model = seasoned(IDAM(SMALL.config), torch.float32, train=True)
-    _, pairs = split_validation(shapes, 0, 0.0)
+    _, pairs = split_validation(shapes, SMALL)
     scores = validate(model, pairs, batch_size=3)
     assert model.training
     model.eval()
@@ -437,10 +460,21 @@ def started(tmp_path, seasoned) -> Path:
     return path
 
 
+def test_a_checkpoint_is_a_start_as_well(fit, tmp_path):
+    fit(changed(epochs=2 / STEPS), tmp_path / "first")
+    last = load_file(tmp_path / "first" / "best.safetensors")
+    recipe = changed(start=str(tmp_path / "first" / "last.ckpt"))
+    model = initial_model(recipe)
+    assert all(torch.equal(value, last[name]) for name, value in model.state_dict().items())
+    with pytest.raises(InputError, match="not a checkpoint"):
+        (tmp_path / "other.ckpt").write_bytes(b"nonsense")
+        initial_model(changed(start=str(tmp_path / "other.ckpt")))
+
+
 def test_a_start_is_where_the_weights_come_from(fit, started, shapes, tmp_path):
     recipe = changed(start=str(started), epochs=2 / STEPS)
     losses = fit(recipe, tmp_path / "run")
-    train_shapes, _ = split_validation(shapes, 0, 0.0)
+    train_shapes, _ = split_validation(shapes, SMALL)
     expected = SupervisedStep(load_model(started).train(), recipe, "32")(batch_at(train_shapes, recipe, 0, 0, 1))
     assert losses[0].total == expected.total
     assert fit(changed(epochs=2 / STEPS), tmp_path / "random")[0].total != expected.total
@@ -577,7 +611,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_and_nothing_else
 # what is refused
 
 BAD_RECIPES = {
-    "an unknown experiment": ({"experiment": "seen-shapes"}, "unseen-shapes, unseen-categories, gaussian-noise"),
+    "an unknown experiment": ({"experiment": "seen-shapes"}, ", ".join(TRAININGS)),
     "an unknown schedule": ({"schedule": "cosine"}, "step or one-cycle"),
     "unknown features": ({"config": Config(features="sift")}, "gnn or fpfh"),
     "no epochs": ({"epochs": 0}, "epochs"),
@@ -592,6 +626,8 @@ BAD_RECIPES = {
     "a negative radius": ({"radius": -0.05}, "radius"),
     "a share of points above one": ({"keep": 1.5}, "share"),
     "no points": ({"keep": 0.0}, "share"),
+    "negative noise": ({"noise": -0.01}, "sigma"),
+    "noise that is no number": ({"noise": math.nan}, "sigma"),
     "a huge seed": ({"seed": 10**13}, "seed"),
 }
 BAD_OPTIONS = {
@@ -638,7 +674,7 @@ def test_a_training_that_diverges_stops_and_leaves_no_model(fit, tmp_path):
 def test_a_missing_data_folder_is_refused_in_one_line(tmp_path, monkeypatch):
     for package in ("lightning_fabric", "tensorboard", "h5py"):
         pytest.importorskip(package, reason=f"training needs {package}")
-    monkeypatch.setattr(training, "keep_freed_memory", lambda: True)
+    monkeypatch.setattr(loop, "keep_freed_memory", lambda: True)
     with pytest.raises(InputError, match="nowhere") as caught:
         train(SMALL, tmp_path / "nowhere", tmp_path / "out", device="cpu")
     assert "\n" not in str(caught.value)

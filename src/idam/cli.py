@@ -172,7 +172,7 @@ def models() -> None:
 
 @app.command()
 def train(
-    experiment: Annotated[str, typer.Argument(help="unseen-shapes, unseen-categories or gaussian-noise.")],
+    experiment: Annotated[str, typer.Argument(help="unseen-shapes, unseen-categories, gaussian-noise or general.")],
     data: Data,
     features: Annotated[str, typer.Option(help="Point features: gnn or fpfh.")] = "gnn",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the weights and the log.")] = None,
@@ -186,6 +186,7 @@ def train(
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
     ] = False,
+    radius: Annotated[float, typer.Option(help="Distance within which points match.")] = 0.05,
     noise: Annotated[
         float | None, typer.Option(help="Sigma of the noise on both clouds; the experiment's own if left out.")
     ] = None,
@@ -223,6 +224,7 @@ def train(
         learning_rate=learning_rate,
         start=start,
         eliminate=eliminate,
+        radius=radius,
         noise=noise,
         seed=seed,
     )

@@ -15,7 +15,8 @@ from idam.errors import InputError
 from idam.evaluation import experiments
 from idam.evaluation.experiments import AXISYMMETRIC, TABLES, read_pairs
 from idam.geometry import random_rotation
-from idam.training import split_validation
+from idam.training import Recipe
+from idam.training.batches import split_validation
 
 
 def same(one: Pairs, other: Pairs) -> bool:
@@ -64,7 +65,7 @@ def test_the_test_split_of_the_experiment_is_read(monkeypatch, shapes):
 
 
 def test_test_pairs_are_other_ones_than_those_that_pick_the_checkpoint(shapes):
-    _, validation = split_validation(Shapes(shapes.points.repeat(10, 1, 1), torch.arange(60)), 0, 0.0)
+    _, validation = split_validation(Shapes(shapes.points.repeat(10, 1, 1), torch.arange(60)), Recipe())
     test = experiments.test_set("unseen-shapes", "anywhere").pairs
     assert torch.cdist(test.translation, validation.translation).min() > 1e-4
 

@@ -1,0 +1,61 @@
+"""The pairs of each step, and those that pick the checkpoint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from idam.data.general import make_general_pairs
+from idam.data.modelnet40 import Shapes
+from idam.data.pairs import Pairs, fixed_pairs, make_pairs
+from idam.geometry import apply_transform
+from idam.network.elimination import share_of
+from idam.network.sampling import balanced_sample
+from idam.training.recipe import Recipe
+
+__all__ = ["Batch", "batch_at", "split_validation"]
+
+VALIDATION_SHAPES = 200
+VALIDATION_SEED = 7
+
+
+class Batch(NamedTuple):
+    """Pairs (:class:`idam.data.pairs.Pairs`) and the rows (B, M) of each cloud that balanced sampling drew."""
+
+    source: Tensor
+    target: Tensor
+    rotation: Tensor
+    translation: Tensor
+    source_index: Tensor
+    target_index: Tensor
+
+
+def split_validation(shapes: Shapes, recipe: Recipe) -> tuple[Shapes, Pairs]:
+    """Shapes to train on, and fixed pairs of the 200 others (a tenth, where there are few) that pick the checkpoint."""
+    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed))
+    held = min(VALIDATION_SHAPES, max(1, len(shapes) // 10))
+    train = Shapes(shapes.points[order[held:]], shapes.labels[order[held:]])
+    points = shapes.points[order[:held]]
+    if recipe.experiment == "general":
+        generator = torch.Generator().manual_seed(VALIDATION_SEED)
+        return train, make_general_pairs(points, generator, recipe.max_angle)
+    return train, fixed_pairs(points, VALIDATION_SEED, recipe.sigma)
+
+
+def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -> Batch:
+    """The pairs and sampled points of one process at one step, a function of the seed and the step alone."""
+    per_epoch = len(shapes) // recipe.batch_size
+    epoch, position = divmod(step, per_epoch)
+    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
+    rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
+    generator = torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
+    if recipe.experiment == "general":
+        pairs = make_general_pairs(shapes.points[rows], generator, recipe.max_angle)
+    else:
+        pairs = make_pairs(shapes.points[rows], generator, recipe.sigma)
+    aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
+    count = share_of(pairs.source.shape[1], recipe.keep)
+    source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)
+    return Batch(pairs.source, pairs.target, pairs.rotation, pairs.translation, source_index, target_index)

@@ -1,0 +1,153 @@
+"""The training loop (section 4): pairs, balanced sampling, loss, Adam, checkpoints."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import torch
+
+from idam.data.modelnet40 import experiment_shapes
+from idam.data.pairs import Pairs
+from idam.errors import InputError, MissingDependencyError
+from idam.evaluation.metrics import Metrics, measure
+from idam.io import make_folder
+from idam.memory import keep_freed_memory
+from idam.network.model import IDAM
+from idam.network.pretrained import save_model
+from idam.network.supervision import Loss
+from idam.training.batches import batch_at, split_validation
+from idam.training.checkpoint import Progress, history, initial_model, restore, save_checkpoint
+from idam.training.log import Log
+from idam.training.recipe import Recipe, check
+from idam.training.step import SupervisedStep
+
+__all__ = ["train", "validate"]
+
+
+def train(
+    recipe: Recipe,
+    data: str | Path,
+    output: str | Path,
+    *,
+    resume: bool = False,
+    device: str = "auto",
+    precision: str = "32",
+    validate_every: int = 250,
+    command: str = "",
+) -> Path:
+    """Train one model and keep its best checkpoint.
+
+    Args:
+        recipe: what and how.
+        data: folder of ModelNet40 (:func:`idam.data.modelnet40.load`).
+        output: folder for ``best.safetensors``, ``last.ckpt`` and the TensorBoard log.
+        resume: go on from ``last.ckpt`` where there is one.
+        device: ``auto``, ``cpu`` or ``cuda``; under ``torchrun`` each process takes its own.
+        precision: ``32``, or ``bf16`` for matrix products and activations in bfloat16.
+        validate_every: steps between validations and checkpoints.
+        command: the command line, for the provenance.
+
+    Returns:
+        Path of the best model.
+
+    Raises:
+        InputError: the data, the output folder or the recipe cannot be used.
+        MissingDependencyError: the ``train`` extra is not installed.
+    """
+    try:
+        from lightning_fabric import Fabric
+        from torch.utils.tensorboard import SummaryWriter  # noqa: F401 - for the log
+    except ImportError as error:
+        raise MissingDependencyError(
+            "training needs Lightning Fabric and TensorBoard: pip install 'idam[train]'"
+        ) from error
+    check(recipe)
+    check_run(device, precision, validate_every)
+    output = make_folder(output)
+    keep_freed_memory()
+    fabric = Fabric(
+        accelerator=device,
+        devices=int(os.environ.get("LOCAL_WORLD_SIZE", 1)),
+        num_nodes=int(os.environ.get("GROUP_WORLD_SIZE", 1)),
+    )
+    fabric.launch()
+    torch.manual_seed(recipe.seed)
+    shapes, validation = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe)
+    check_batch(recipe.batch_size, len(shapes), fabric.world_size)
+    total = max(1, round(recipe.epochs * (len(shapes) // recipe.batch_size)))
+    module = SupervisedStep(initial_model(recipe), recipe, precision)
+    optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    progress = restore(output / "last.ckpt", module, optimizer, recipe) if resume else Progress()
+    step_module, step_optimizer = fabric.setup(module, optimizer)
+    started = time.monotonic() - progress.seconds
+    with Log(output, total, progress.step, enabled=fabric.is_global_zero) as log:
+        for step in range(progress.step, total):
+            for group in step_optimizer.param_groups:
+                group["lr"] = recipe.rate(step / total)
+            batch = batch_at(shapes, recipe, step, fabric.global_rank, fabric.world_size)
+            loss: Loss = step_module(fabric.to_device(batch))
+            fabric.backward(loss.total)
+            step_optimizer.step()
+            step_optimizer.zero_grad()
+            log.step(step, loss)
+            if (step + 1) % validate_every == 0 or step + 1 == total:
+                check_finite(module, step)
+                progress.step, progress.seconds = step + 1, time.monotonic() - started
+                if fabric.is_global_zero:
+                    scores = validate(module.model, validation)
+                    log.validation(step, scores)
+                    if scores.mae_r < progress.best:
+                        progress.best = scores.mae_r
+                        save_model(
+                            output / "best.safetensors",
+                            module.model,
+                            history(recipe, progress, scores, len(validation), command),
+                        )
+                    save_checkpoint(output / "last.ckpt", module, optimizer, progress, recipe)
+                fabric.barrier()
+    return output / "best.safetensors"
+
+
+@torch.inference_mode()
+def validate(model: IDAM, pairs: Pairs, batch_size: int = 50) -> Metrics:
+    """Errors of the network alone on pairs."""
+    was_training, device = model.training, next(model.parameters()).device
+    model.eval()
+    estimates = []
+    for start in range(0, len(pairs), batch_size):
+        batch = pairs[start : start + batch_size].to(device)
+        output = model(batch.source, batch.target)
+        estimates.append((output.rotation.cpu(), output.translation.cpu()))
+    model.train(was_training)
+    rotation, translation = (torch.cat(parts) for parts in zip(*estimates, strict=True))
+    return measure(rotation, translation, pairs.rotation, pairs.translation)
+
+
+def check_run(device: str, precision: str, validate_every: int) -> None:
+    """Raise InputError where a recipe cannot be run this way here."""
+    if device not in ("auto", "cpu", "cuda"):
+        raise InputError(f"unknown device {device!r}: choose auto, cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("there is no CUDA device here: choose another --device")
+    if precision not in ("32", "bf16"):
+        raise InputError(f"unknown precision {precision!r}: choose 32 or bf16")
+    if validate_every < 1:
+        raise InputError(f"cannot validate every {validate_every} steps: choose 1 or more")
+
+
+def check_batch(batch_size: int, shapes: int, processes: int) -> None:
+    """Raise InputError where there are too few shapes for a batch, or too few pairs in one for all processes."""
+    if batch_size > shapes:
+        raise InputError(
+            f"{shapes} shapes to train on do not fill a batch of {batch_size}: choose a smaller --batch-size"
+        )
+    if batch_size < processes:
+        raise InputError(f"{processes} processes cannot share a batch of {batch_size}: choose a larger --batch-size")
+
+
+def check_finite(module: SupervisedStep, step: int) -> None:
+    """Raise InputError where the training has diverged: weights that are no numbers answer identity, which scores."""
+    if not all(parameter.isfinite().all() for parameter in module.parameters()):
+        raise InputError(f"the training has diverged by step {step + 1}: choose a smaller --learning-rate")
