@@ -36,6 +36,9 @@ CORE = 0.98
 GRID = 40
 """Cells along each axis of the image that decides what a viewpoint hides."""
 
+BEHIND = 0.15
+"""How far a point must lie behind another to be hidden by it."""
+
 
 def make_general_pairs(points: Tensor, generator: torch.Generator, max_angle: float = math.pi) -> Pairs:
     """Pairs from whole shapes (B, N, 3), drawn from ``generator`` as one batch.
@@ -141,7 +144,7 @@ def _seen(surface: Tensor, generator: torch.Generator) -> Tensor:
     # the surface is thin in the image: each cell also hides what lies behind its neighbours
     depth = torch.full((count, GRID * GRID), torch.inf).scatter_reduce(1, cell, turned[..., 2], "amin")
     depth = -torch.nn.functional.max_pool2d(-depth.view(count, 1, GRID, GRID), 3, 1, 1).flatten(1)
-    seen = turned[..., 2] < depth.gather(1, cell) + 4.0 / GRID
+    seen = turned[..., 2] < depth.gather(1, cell) + BEHIND
     around = torch.rand(count, 1, generator=generator) >= VIEWS
     return (seen | around).float()
 
