@@ -1,5 +1,7 @@
 """The iteration: shapes, invariances, composition, and what each setting changes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -243,3 +245,65 @@ def test_features_are_chosen_by_name():
     assert build_features(Config(features="fpfh")).channels == 33
     with pytest.raises(ValueError, match="'sift'"):
         build_features(Config(features="sift"))
+
+
+# further tries
+
+
+@pytest.fixture
+def tries(monkeypatch) -> list[tuple[int | None, IDAM, object]]:
+    """What every call of match was given and gave."""
+    calls, match = [], IDAM.match
+
+    def watched(self, source, target, count=None):
+        output = match(self, source, target, count)
+        calls.append((count, source, output))
+        return output
+
+    monkeypatch.setattr(IDAM, "match", watched)
+    return calls
+
+
+def test_a_trusted_pair_is_not_tried_again(make_model, clouds, tries):
+    out = make_model(keep_again=(1.0,), trusted=0.0)(*clouds)
+    assert len(tries) == 1
+    assert torch.equal(out.rotation, tries[0][2].rotation)
+
+
+def test_a_pair_that_stays_untrusted_is_tried_twice_with_each_share_and_twice_the_iterations(make_model, clouds, tries):
+    make_model(keep_again=(0.75, 1.0), trusted=2.0)(*clouds)
+    assert [count for count, _, _ in tries] == [None, 6, 6, 6, 6]
+    assert [keys.points.shape[1] for _, keys, _ in tries] == [20, 30, 30, 40, 40]
+
+
+def test_every_second_try_begins_where_the_best_led_and_its_transform_is_the_whole(make_model, clouds, tries):
+    source, target = clouds
+    model = make_model(keep_again=(1.0,), trusted=2.0)
+    out = model(source, target)
+    first, again, (_, keys, step) = tries[0][2], tries[1][2], tries[2]
+    rotation, translation, trust = first.rotation, first.translation, first.trust
+    take = again.trust > trust
+    rotation = torch.where(take[:, None, None], again.rotation, rotation)
+    translation = torch.where(take[:, None], again.translation, translation)
+    moved = apply_transform(source, rotation, translation)
+    torch.testing.assert_close(keys.points, gather_points(moved, keys.index))
+    torch.testing.assert_close(keys.features, gather_points(model.features(moved), keys.index))
+    for b in range(2):
+        best = homogeneous(rotation[b], translation[b])
+        if step.trust[b] > max(first.trust[b], again.trust[b]):
+            best = homogeneous(step.rotation[b], step.translation[b]) @ best
+        np.testing.assert_allclose(homogeneous(out.rotation[b], out.translation[b]), best, atol=1e-10)
+    assert torch.equal(out.trust, torch.stack([first.trust, again.trust, step.trust]).amax(0))
+    torch.testing.assert_close(out.source.points, gather_points(source, out.source.index))
+
+
+@pytest.mark.parametrize("features", ["gnn", "fpfh"])
+def test_tries_keep_the_trust_from_falling(features, randn, seasoned):
+    source, target = randn(4, 60, 3), randn(4, 70, 3)
+    model = seasoned(IDAM(Config(features=features, neighbours=5, channels=8, keep=1 / 2, trusted=2.0)))
+    trusts = []
+    for keep_again in ((), (0.75,), (0.75, 1.0)):
+        model.config = replace(model.config, keep_again=keep_again)
+        trusts.append(model(source, target).trust)
+    assert (trusts[1] >= trusts[0]).all()
+    assert (trusts[2] >= trusts[1]).all()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -124,11 +124,30 @@ class IDAM(nn.Module):
         features = self.encode(source, target)
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
         for keep in self.config.keep_again:
-            if bool((output.trust >= self.config.trusted).all()):
-                break
-            key_points = self.eliminate(source, features[0], keep), self.eliminate(target, features[1], keep)
-            output = better(output, self.match(*key_points, 2 * self.config.iterations), self.config.trusted)
+            for again in (self._from_the_start, self._from_the_best):
+                if bool((output.trust >= self.config.trusted).all()):
+                    return output
+                output = better(output, again(source, target, features, keep, output), self.config.trusted)
         return output
+
+    def _from_the_start(
+        self, source: Tensor, target: Tensor, features: tuple[Tensor, Tensor], keep: float, _: Output
+    ) -> Output:
+        """Another try, with a share of the points to keep and twice the iterations."""
+        keys = self.eliminate(source, features[0], keep), self.eliminate(target, features[1], keep)
+        return self.match(*keys, 2 * self.config.iterations)
+
+    def _from_the_best(
+        self, source: Tensor, target: Tensor, features: tuple[Tensor, Tensor], keep: float, best: Output
+    ) -> Output:
+        """Another try from where the best one led: features that turn with the cloud are more alike there."""
+        moved = apply_transform(source, best.rotation, best.translation)
+        moved_features = features[0] if self.features.rotation_invariant else self.features(moved)
+        step = self._from_the_start(moved, target, (moved_features, features[1]), keep, best)
+        with torch.autocast(source.device.type, enabled=False):
+            rotation, translation = compose(step.rotation, step.translation, best.rotation, best.translation)
+        keys = replace(step.source, points=gather_points(source, step.source.index))
+        return replace(step, rotation=rotation, translation=translation, source=keys)
 
     def encode(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, N, K) and (B, P, K) of both clouds; equally large clouds go through as one batch."""
