@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -371,6 +372,53 @@ def test_evaluate_refuses_a_file_it_cannot_use_in_one_line(spoil, message, idam,
 def test_a_wrong_evaluation_ends_its_process_with_code_2_and_one_line(tmp_path):
     outcome = process("evaluate", "--pairs", tmp_path / "no.npz", module=("idam",))
     assert_refused(outcome, r"no\.npz: no such file")
+
+
+# idam data and idam figures
+
+
+def test_a_folder_that_holds_modelnet40_is_checked(idam, trainable):
+    outcome = idam("data", "modelnet40", trainable)
+    assert outcome.code == 0
+    assert outcome.out == f"ModelNet40 is in {trainable}\n"
+
+
+def test_modelnet40_is_fetched_from_an_archive(idam, trainable, tmp_path):
+    archive = tmp_path / "copy.zip"
+    with zipfile.ZipFile(archive, "w") as packed:
+        for file in (path for path in trainable.rglob("*") if path.is_file()):
+            packed.write(file, f"modelnet40_ply_hdf5_2048/{file.name}")
+    wrong = idam("data", "modelnet40", tmp_path / "new", "--url", archive.as_uri(), "--sha256", "0" * 64)
+    assert_refused(wrong, "checksum|SHA-256")
+    assert idam("data", "modelnet40", tmp_path / "new", "--url", archive.as_uri()).code == 0
+    assert len(experiment_shapes("unseen-shapes", tmp_path / "new", "test")) == len(
+        experiment_shapes("unseen-shapes", trainable, "test")
+    )
+
+
+def test_an_address_that_is_none_is_refused_in_one_line(idam, tmp_path):
+    assert_refused(idam("data", "modelnet40", tmp_path / "new", "--url", "nonsense"), "http")
+    assert not (tmp_path / "new").exists()
+
+
+def test_figures_are_drawn_with_the_options_given(idam, trainable, tmp_path, monkeypatch):
+    figures = pytest.importorskip("idam.figures", reason="figures need Matplotlib")
+    asked = []
+    monkeypatch.setattr(
+        figures, "draw_figures", lambda *args, **options: (asked.append((args, options)), [Path("a")])[1]
+    )
+    words = ["figures", tmp_path, "--data", trainable, "--scan", "a.ply", "--scan", "b.ply", "--speed", "s.json"]
+    outcome = idam(*words, "--model", "mine")
+    assert (outcome.code, outcome.out) == (0, "a\n")
+    ((args, options),) = asked
+    assert args == (tmp_path, trainable)
+    assert options.pop("progress") is cli.tell
+    assert options == {"scans": [Path("a.ply"), Path("b.ply")], "speed": Path("s.json"), "model": "mine"}
+
+
+def test_figures_refuse_an_odd_number_of_scans(idam, trainable, tmp_path):
+    outcome = idam("figures", tmp_path / "out", "--data", trainable, "--scan", "a.ply")
+    assert_refused(outcome, "scan|pip install")
 
 
 # idam models

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -46,6 +48,8 @@ def main() -> NoReturn:
         usage = getattr(error, "format_message", None)  # what the parser raises for a wrong call
         if usage is None:
             raise
+        if not usage():  # no command: the help has been printed
+            sys.exit(BAD_INPUT)
         stop(f"{usage()} See 'idam --help'.", BAD_INPUT)
     sys.exit(code if isinstance(code, int) else 0)
 
@@ -295,6 +299,70 @@ def evaluate(
         resume=resume,
         command=shlex.join(["idam", *sys.argv[1:]]),
     )
+
+
+@app.command()
+def figures(
+    output: Annotated[Path, typer.Argument(help="Folder for the figures, each as PNG and SVG.")],
+    data: Data,
+    scans: Annotated[
+        list[Path] | None, typer.Option("--scan", help="Scans to register without fine-tuning: source, target, ...")
+    ] = None,
+    speed: Annotated[Path | None, typer.Option(help="Times that benchmarks/speed.py --json wrote, to plot.")] = None,
+    model: Annotated[str, typer.Option(help="Weights for the figures with noise.")] = "gnn-gaussian-noise",
+) -> None:
+    """Draw the figures of the paper's appendix B, and curves of error, validity and speed.
+
+    [bold]Example[/bold]
+
+      idam figures out --data modelnet40 --scan bun045.ply --scan bun000.ply
+    """
+    from idam.figures import draw_figures
+
+    for path in draw_figures(output, data, scans=scans or (), speed=speed, model=model, progress=tell):
+        print(path)
+
+
+def tell(what: str) -> None:
+    """Say on a terminal's stderr what is being done."""
+    if sys.stderr.isatty():
+        print(what, file=sys.stderr)
+
+
+data_app = typer.Typer(help="Fetch the data that models are trained and measured on.", no_args_is_help=True)
+app.add_typer(data_app, name="data")
+
+
+@data_app.callback()
+def about_data() -> None:
+    """Fetch the data that models are trained and measured on."""
+
+
+@data_app.command()
+def modelnet40(
+    folder: Annotated[Path, typer.Argument(help="Where to put it, then to be given as --data.")],
+    url: Annotated[str | None, typer.Option(help="Of the archive, where the usual address does not answer.")] = None,
+    sha256: Annotated[str | None, typer.Option(help="Of the archive, to check before unpacking.")] = None,
+) -> None:
+    """Download ModelNet40 (435 MB) and unpack it, go on with a broken download, or check a folder that has it."""
+    from idam.data.download import MODELNET40_URL, fetch_modelnet40
+
+    with download_bar() as advance:
+        found = fetch_modelnet40(folder, url or MODELNET40_URL, sha256, progress=advance)
+    print(f"ModelNet40 is in {found}")
+
+
+@contextmanager
+def download_bar() -> Iterator[Callable[[int, int | None], None]]:
+    """A bar of bytes on stderr, and the function that moves it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+
+    console = Console(stderr=True)
+    columns = BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 @app.command()
