@@ -1,6 +1,6 @@
-"""Time of one registration: the network alone, ``register``, and Open3D's classical methods, interleaved in one run.
+"""Time of one registration by each row of the tables, interleaved in one run.
 
-    python benchmarks/speed.py [--points 1024 2048 4096] [--repeats 15] [--json FILE]
+    python benchmarks/speed.py [--points 1024 2048 4096] [--repeats 15] [--methods NAME ...] [--json FILE]
 
 The pairs follow the paper's protocol on a part made here, so that no data is needed. Every repeat times
 every method once, in turn, and the table gives medians: on a busy machine compare within a run, never across runs.
@@ -12,22 +12,21 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
 
-import idam
 from idam.data.pairs import MAX_ANGLE
+from idam.errors import MissingDependencyError
+from idam.evaluation.methods import METHODS, Method, build_method
 from idam.geometry import euler_xyz_to_rotation
 
 Points = NDArray[np.float32]
-Method = Callable[[Points, Points], object]
+ENDLESS = ("go-icp",)
+"""Rows that take a minute a pair; name them to time them."""
 
 
 def make_pair(points: int, seed: int) -> tuple[Points, Points]:
@@ -48,42 +47,15 @@ def make_pair(points: int, seed: int) -> tuple[Points, Points]:
     return crops[0].astype(np.float32), crops[1].astype(np.float32)
 
 
-def network(name: str) -> Method:
-    """The network alone."""
-    model = idam.load_model(name)
-
-    @torch.inference_mode()
-    def run(source: Points, target: Points) -> object:
-        return model(torch.from_numpy(source)[None], torch.from_numpy(target)[None])
-
-    return run
-
-
-def open3d_methods() -> dict[str, Method]:
-    """FPFH with RANSAC, and FGR, with the settings published with the paper's rows; empty without Open3D."""
-    try:
-        # by name: whether its stubs are installed must not change the verdict on types
-        o3d: Any = import_module("open3d")
-    except ImportError as error:
-        print(f"Open3D cannot be imported ({error}): pip install 'idam[benchmark]'")
-        return {}
-    pipeline = o3d.pipelines.registration
-
-    def features(points: Points) -> tuple[Any, Any]:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.1, 30))
-        return cloud, pipeline.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(0.25, 100))
-
-    def ransac(source: Points, target: Points) -> object:
-        (a, fa), (b, fb) = features(source), features(target)
-        return pipeline.registration_ransac_based_on_feature_matching(a, b, fa, fb, True, 0.05)
-
-    def fgr(source: Points, target: Points) -> object:
-        (a, fa), (b, fb) = features(source), features(target)
-        option = pipeline.FastGlobalRegistrationOption(maximum_correspondence_distance=0.02)
-        return pipeline.registration_fgr_based_on_feature_matching(a, b, fa, fb, option)
-
-    return {"Open3D FPFH+RANSAC": ransac, "Open3D FGR": fgr}
+def build_methods(names: list[str]) -> dict[str, Method]:
+    """Each row's method, with the weights for clean pairs; without those that cannot run here, which say why."""
+    methods: dict[str, Method] = {}
+    for name in names:
+        try:
+            methods[name] = build_method(name)
+        except MissingDependencyError as error:
+            print(f"{name}: {error}")
+    return methods
 
 
 def measure(methods: dict[str, Method], points: int, repeats: int) -> dict[str, float]:
@@ -104,11 +76,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, nargs="+", default=[1024, 2048, 4096])
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--methods", nargs="+", default=[name for name in METHODS if name not in ENDLESS])
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    methods: dict[str, Method] = {f"network {name}": network(name) for name in idam.list_models()}
-    methods["idam.register"] = idam.register
-    methods |= open3d_methods()
+    methods = build_methods(arguments.methods)
     results = {points: measure(methods, points, arguments.repeats) for points in arguments.points}
     width = max(map(len, methods))
     print(f"{'median ms':<{width}}" + "".join(f"{points:>10}" for points in results))

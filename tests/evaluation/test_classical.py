@@ -87,7 +87,7 @@ def test_a_missing_package_is_named_with_the_command_that_brings_it(name, packag
 
 def test_go_icp_is_named_with_the_command_that_brings_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "py_simple_go_icp_interface.main", None)
-    with pytest.raises(MissingDependencyError, match="pip install py-simple-go-icp-interface"):
+    with pytest.raises(MissingDependencyError, match=r"g\+\+.*pip install 'idam\[benchmark\]'"):
         build_method("go-icp")
 
 

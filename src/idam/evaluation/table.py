@@ -13,7 +13,7 @@ from idam.evaluation.paper import PAPER
 from idam.evaluation.record import Missing
 from idam.evaluation.runner import Row
 
-__all__ = ["Board", "results_table"]
+__all__ = ["Board", "columns", "results_table"]
 
 WIDTH = 130
 """Columns of a table that is not printed to a terminal."""
@@ -21,16 +21,29 @@ WIDTH = 130
 Cell = Callable[[Row], str]
 
 
+def columns(experiment: str) -> dict[str, Cell]:
+    """Headings of a table, and what stands below each for a row.
+
+    Of the paper's experiments, what the paper reports, its figures in brackets; of practice pairs, what counts there.
+    """
+    middle = _practice_columns() if experiment.startswith("practice") else _paper_columns(experiment)
+    return {
+        "method": _name,
+        **middle,
+        "pairs": lambda row: str(row.pairs),
+        "ms a pair": lambda row: f"{row.seconds_per_pair * 1000:.1f}",
+    }
+
+
 def results_table(experiment: str, rows: list[Row | Missing]) -> Table:
-    """The rows as the paper sets them, its own figures in brackets; of practice pairs, what counts there."""
-    columns = _practice_columns() if experiment.startswith("practice") else _paper_columns(experiment)
-    table = Table("method", *columns, "pairs", "ms a pair")
+    """The rows as a table for the terminal; a row that could not be computed says why."""
+    cells = columns(experiment)
+    table = Table(*cells)
     for row in rows:
         if isinstance(row, Missing):
             table.add_row(row.task.method, row.reason.split(":")[0])
-            continue
-        cells = [cell(row) for cell in columns.values()]
-        table.add_row(_name(row), *cells, str(row.pairs), f"{row.seconds_per_pair * 1000:.1f}")
+        else:
+            table.add_row(*(cell(row) for cell in cells.values()))
     return table
 
 

@@ -39,7 +39,7 @@ def build(model: str | None, settings: Sequence[str]) -> Method:
         match: Any = import_module("py_simple_go_icp_interface.main").go_icp_match_raw
     except ImportError:
         raise MissingDependencyError(
-            "this method needs Go-ICP, and g++ to compile it: pip install py-simple-go-icp-interface"
+            "this method needs Go-ICP, and g++ to compile it: pip install 'idam[benchmark]'"
         ) from None
 
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
