@@ -27,6 +27,7 @@ class Settings:
         icp_distance: ICP's largest distance of a match.
         icp_iterations: ICP's largest number of iterations.
         fgr_distance: fast global registration's largest distance of a match.
+        fgr_anneal: whether it shrinks its robust kernel down to that distance, without which the distance says nothing.
         ransac_distance: RANSAC's largest distance of an inlier.
         ransac_iterations: RANSAC's largest number of iterations.
         icp_after: largest distance of a match of an ICP that follows the method; 0 for none.
@@ -37,6 +38,7 @@ class Settings:
     icp_distance: float = 100.0
     icp_iterations: int = 500
     fgr_distance: float = 0.02
+    fgr_anneal: bool = False
     ransac_distance: float = 0.05
     ransac_iterations: int = 100_000
     icp_after: float = 0.0
@@ -109,7 +111,9 @@ def _icp_from(o3d: Any, source: Any, target: Any, distance: float, settings: Set
 
 def _fgr(o3d: Any, source: Any, target: Any, settings: Settings) -> Any:
     registration = o3d.pipelines.registration
-    option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=settings.fgr_distance)
+    option = registration.FastGlobalRegistrationOption(
+        maximum_correspondence_distance=settings.fgr_distance, decrease_mu=settings.fgr_anneal
+    )
     features = _fpfh(o3d, source, settings), _fpfh(o3d, target, settings)
     return registration.registration_fgr_based_on_feature_matching(source, target, *features, option)
 
