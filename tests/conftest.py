@@ -1,6 +1,6 @@
 """What tests share: precision, randomness, and the network's building block written out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import pytest
@@ -38,6 +38,15 @@ def randn(generator: torch.Generator) -> Callable[..., Tensor]:
 def rand(generator: torch.Generator) -> Callable[..., Tensor]:
     """Seeded uniforms in [0, 1), float64 unless the call says otherwise."""
     return partial(torch.rand, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """As processes that share the cores have: sums in another order round otherwise, and steps can hang on that."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture

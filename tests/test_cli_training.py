@@ -204,15 +204,6 @@ TORCHRUN = ("torch.distributed.run", "--nproc-per-node=2", "--rdzv-backend=c10d"
 TORCHRUN = (*TORCHRUN, "--local-addr=127.0.0.1", "-m", "idam")
 
 
-@pytest.fixture
-def one_thread():
-    """As torchrun's processes have: sums in another order round otherwise, and Adam makes steps of the difference."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def on_averaged_gradients(recipe: Recipe, data: Path, steps: int) -> dict[str, torch.Tensor]:
     """Weights after some steps with the mean of the gradients that two processes see."""
     torch.manual_seed(recipe.seed)

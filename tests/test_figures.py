@@ -388,7 +388,7 @@ def test_text_is_of_8_points_or_more_and_nothing_is_cut_off(drawn, randn):
         figure.draw_without_rendering()
         inches = figure.get_tightbbox()
     width, height = figure.get_size_inches()
-    assert 0 <= inches.x0 < inches.x1 <= width <= 4.8
+    assert 0 <= inches.x0 < inches.x1 <= width <= 4.8  # the paper's text
     assert 0 <= inches.y0 < inches.y1 <= height
     texts = [text for text in figure.findobj(Text) if text.get_text()]
     assert texts

@@ -163,7 +163,7 @@ def test_same_seed_same_bits(result: RegistrationResult) -> None:
 def test_any_seed_finds_the_easy_pair(result: RegistrationResult, seed: Any) -> None:
     other = idam.register(SOURCE, TARGET, seed=seed)
     assert_settled(other.transformation, result.transformation, CENTRE)
-    assert (other.matches.source != result.matches.source).any()
+    assert other.evidence != result.evidence  # other starts, other votes
 
 
 def test_clouds_are_left_as_they_were() -> None:

@@ -194,7 +194,7 @@ def test_general_pairs_are_drawn_as_far_apart_as_the_features_can_take(features,
     recipe = changed(experiment="general", config=Config(features=features))
     train_shapes, validation = split_validation(shapes, recipe)
     batches = [batch_at(train_shapes, recipe, step, 0, 1) for step in range(12)]
-    angles = rotation_angle(torch.cat([validation.rotation, *(batch.rotation for batch in batches)])).rad2deg()
+    angles = rotation_angle(torch.cat([validation.rotation, *(batch.rotation for batch in batches)]))
     assert (angles.max() > 90) == (features == "fpfh")
     assert validation.source.shape == validation.target.shape == (4, POINTS, 3)
     assert torch.equal(batches[3].source, batch_at(train_shapes, recipe, 3, 0, 1).source)

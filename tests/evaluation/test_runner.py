@@ -119,7 +119,7 @@ def test_what_would_run_for_days_takes_the_first_pairs_alone(test, given, monkey
 
 
 @pytest.mark.parametrize("jobs", [2, 9])
-def test_several_processes_find_what_one_does(jobs, test):
+def test_several_processes_find_what_one_does(jobs, test, one_thread):
     task = Task("gnn-idam", "gnn-unseen-shapes", ("keep=0.9", "neighbours=12"))
     advanced = []
     shared = run(task, test, lambda: advanced.append(1), jobs)

@@ -26,9 +26,11 @@ AZIMUTH, ELEVATION = math.radians(35), math.radians(20)
 PALEST = 0.6
 """Share of white in the colour of the farthest points."""
 DASHES = (0, (4, 2))
-TURNED_BACK = "The target, right or below, is turned back by the true transform:\nright matches run parallel."
+RATIO = 5 / 3
+"""Width over height of a panel of matches."""
+TURNED_BACK = "target (right or below) turned back by the truth: right matches are parallel"
 LETTER = 0.062
-"""Inches that a letter of a title takes, about."""
+"""Inches that a letter of a title takes, at most on average."""
 
 Array = NDArray[np.float64]
 
@@ -80,13 +82,13 @@ def draw_matches(shapes: Sequence[Matches], up: int) -> Figure:
     columns = min(len(shapes), 2)
     rows = math.ceil(len(shapes) / columns)
     side = PAGE / columns
-    figure = Figure((PAGE, rows * (side * 0.6 + 0.2) + 0.55), layout="constrained")
+    figure = Figure((PAGE, rows * (side / RATIO + 0.2) + 0.4), layout="constrained")
     grid = _empty_grid(figure, rows, columns)
     for n, shape in enumerate(shapes):
         axes = grid[n // columns][n % columns]
         _title(axes, shape.name, side)
         _draw_shape_matches(axes, shape, up)
-        _same_scale([axes], ratio=5 / 3)
+        _same_scale([axes], RATIO)
     weighted = Line2D([], [], color=GREEN, label="match with weight")
     others = Line2D([], [], color=VERMILLION, linestyle=DASHES, label="match without")
     _legend(figure, [weighted, others], TURNED_BACK)
@@ -97,8 +99,9 @@ def _draw_shape_matches(axes: Axes, shape: Matches, up: int) -> None:
     source, target = project(shape.source, up), project(shape.target, up)
     start, end = project(shape.start, up), project(shape.end, up)
     width, height, _ = np.ptp(np.concatenate([source, target]), axis=0)
-    # beside a high shape, below a wide one: so the matches spread
-    aside = np.array([width + 0.4 * height, 0.0, 0.0] if height > width else [0.0, -height - 0.4 * width, 0.0])
+    beside, below = width + 0.4 * height, height + 0.4 * width
+    wide = max(width, RATIO * (height + below)) < max(width + beside, RATIO * height)  # then it is larger that way
+    aside = np.array([0.0, -below, 0.0] if wide else [beside, 0.0, 0.0])
     _draw_clouds(axes, (source, GREY), (target + aside, GREY))
     weighted = shape.weighted.numpy()
     for those, colour, style in ((~weighted, VERMILLION, DASHES), (weighted, GREEN, "-")):
