@@ -12,7 +12,8 @@ from idam.figures.timings import Timings
 
 __all__ = ["draw_calibration", "draw_iterations", "draw_timings"]
 
-MARKERS = "osD^vPX"
+MARKERS = "osD^vPX*"
+"""One more than there are colours, so that lines of one colour differ in their markers."""
 
 
 def draw_iterations(errors: Tensor) -> Figure:
@@ -56,7 +57,7 @@ def draw_calibration(calibration: Calibration) -> Figure:
 
 def draw_timings(timings: Timings) -> Figure:
     """Milliseconds by points, one line for each method; the legend is in the order of the lines."""
-    figure = Figure((PAGE, 2.6), layout="constrained")
+    figure = Figure((PAGE, max(2.6, 0.2 + 0.18 * len(timings.milliseconds))), layout="constrained")
     axes = figure.subplots()
     for n, (method, times) in enumerate(timings.milliseconds.items()):
         colour, marker = PALETTE[n % len(PALETTE)], MARKERS[n % len(MARKERS)]
@@ -72,5 +73,5 @@ def draw_timings(timings: Timings) -> Figure:
     axes.set_xlabel("points of each cloud")
     axes.set_ylabel("median time in ms")
     axes.set_title(f"{timings.threads} thread{'' if timings.threads == 1 else 's'}")
-    figure.legend(loc="outside right upper")
+    figure.legend(loc="outside right upper", handlelength=2.8)
     return figure
