@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
 from idam.geometry import apply_transform, euler_xyz_to_rotation, gather_points
 
-__all__ = ["EXPERIMENTS", "Pairs", "experiment_noise", "fixed_pairs", "make_pairs"]
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    D = TypeVar("D", bound=DataclassInstance)
+
+__all__ = ["EXPERIMENTS", "Pairs", "drawn_singly", "experiment_noise", "fixed_pairs", "make_pairs"]
 
 EXPERIMENTS = ("unseen-shapes", "unseen-categories", "gaussian-noise")
 """The paper's experiments (sections 4.1 to 4.3)."""
@@ -76,11 +83,15 @@ def make_pairs(points: Tensor, generator: torch.Generator, noise: float = 0.0) -
 
 def fixed_pairs(points: Tensor, seed: int, noise: float = 0.0) -> Pairs:
     """Test pairs from whole shapes (B, N, 3): each depends on the seed and its index alone."""
-    draws = []
-    for index in range(len(points)):
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
-        draws.append(_draw(1, points.shape[1], generator, noise))
-    return _build(points, _Draw(*(torch.cat([getattr(d, f.name) for d in draws]) for f in fields(_Draw))))
+    return _build(
+        points, drawn_singly(lambda generator: _draw(1, points.shape[1], generator, noise), len(points), seed)
+    )
+
+
+def drawn_singly(draw: Callable[[torch.Generator], D], count: int, seed: int) -> D:
+    """``count`` draws (dataclasses of tensors (1, ...)) as one, each from the seed and its index alone."""
+    draws = [draw(torch.Generator().manual_seed(seed * 1_000_003 + index)) for index in range(count)]
+    return type(draws[0])(*(torch.cat([getattr(d, f.name) for d in draws]) for f in fields(draws[0])))
 
 
 def _draw(count: int, points: int, generator: torch.Generator, noise: float) -> _Draw:

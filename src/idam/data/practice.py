@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from idam.data.pairs import MAX_ANGLE, MAX_TRANSLATION, NOISE, NOISE_CLIP, Pairs
+from idam.data.pairs import MAX_ANGLE, MAX_TRANSLATION, NOISE, NOISE_CLIP, Pairs, drawn_singly
 from idam.geometry import apply_transform, euler_xyz_to_rotation, gather_points, quaternion_to_rotation
 
 __all__ = ["KEPT", "fixed_practice_pairs", "make_practice_pairs"]
@@ -46,10 +46,7 @@ def make_practice_pairs(points: Tensor, generator: torch.Generator, *, any_rotat
 
 def fixed_practice_pairs(points: Tensor, seed: int, *, any_rotation: bool) -> Pairs:
     """Test pairs from whole shapes (B, N, 3): each depends on the seed and its index alone."""
-    draws = []
-    for index in range(len(points)):
-        draws.append(_draw(1, points.shape[1], torch.Generator().manual_seed(seed * 1_000_003 + index)))
-    drawn = _Draw(*(torch.cat([getattr(draw, field.name) for draw in draws]) for field in fields(_Draw)))
+    drawn = drawn_singly(lambda generator: _draw(1, points.shape[1], generator), len(points), seed)
     return _build(points, drawn, any_rotation)
 
 

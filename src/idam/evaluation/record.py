@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,12 @@ from idam.io import write_json
 __all__ = ["Missing", "read_rows", "write_record"]
 
 
+@dataclass(frozen=True)
 class Missing:
     """A row that could not be computed: which, and why."""
 
-    def __init__(self, task: Task, reason: str) -> None:
-        self.task = task
-        self.reason = reason
+    task: Task
+    reason: str
 
     def to_dict(self) -> dict[str, str]:
         """A record for JSON."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from torch import Tensor, nn
@@ -123,16 +124,17 @@ class IDAM(nn.Module):
         """
         features = self.encode(source, target)
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
-        for keep in self.config.keep_again:
-            for again in (self._from_the_start, self._from_the_best):
-                if bool((output.trust >= self.config.trusted).all()):
-                    return output
-                output = better(output, again(source, target, features, keep, output), self.config.trusted)
+        for keep, onwards in product(self.config.keep_again, (False, True)):
+            if bool((output.trust >= self.config.trusted).all()):
+                break
+            if onwards:
+                again = self._from_the_best(source, target, features, keep, output)
+            else:
+                again = self._from_the_start(source, target, features, keep)
+            output = better(output, again, self.config.trusted)
         return output
 
-    def _from_the_start(
-        self, source: Tensor, target: Tensor, features: tuple[Tensor, Tensor], keep: float, _: Output
-    ) -> Output:
+    def _from_the_start(self, source: Tensor, target: Tensor, features: tuple[Tensor, Tensor], keep: float) -> Output:
         """Another try, with a share of the points to keep and twice the iterations."""
         keys = self.eliminate(source, features[0], keep), self.eliminate(target, features[1], keep)
         return self.match(*keys, 2 * self.config.iterations)
@@ -143,7 +145,7 @@ class IDAM(nn.Module):
         """Another try from where the best one led: features that turn with the cloud are more alike there."""
         moved = apply_transform(source, best.rotation, best.translation)
         moved_features = features[0] if self.features.rotation_invariant else self.features(moved)
-        step = self._from_the_start(moved, target, (moved_features, features[1]), keep, best)
+        step = self._from_the_start(moved, target, (moved_features, features[1]), keep)
         with torch.autocast(source.device.type, enabled=False):
             rotation, translation = compose(step.rotation, step.translation, best.rotation, best.translation)
         keys = replace(step.source, points=gather_points(source, step.source.index))
