@@ -16,12 +16,14 @@ from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import idam
 from idam.data.parts import View, partial_views, random_part
+from idam.figures.curves import calibrate
 
 FILE = Path(idam.__file__).parent / "confidence.json"
 Array = NDArray[np.float64]
@@ -65,13 +67,6 @@ def fit(evidence: Array, right: Array) -> Array:
     return np.asarray(minimize(loss, np.zeros(design.shape[1])).x)
 
 
-def calibration_error(probability: Array, right: Array, bins: int = 10) -> float:
-    """Expected calibration error: mean |probability - share right| over equal bins, weighted by their pairs."""
-    which = np.minimum((probability * bins).astype(int), bins - 1)
-    gaps = [abs(probability[which == b].sum() - right[which == b].sum()) for b in range(bins)]
-    return float(sum(gaps) / len(right))
-
-
 def main() -> None:
     """Measure, fit, print, and write with --write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -95,7 +90,7 @@ def main() -> None:
     w = fit(x[:half], y[:half])
     probability = 1 / (1 + np.exp(-(w[0] + x[half:] @ w[1:])))
     sure = probability >= 0.9
-    error = calibration_error(probability, y[half:])
+    error = calibrate(torch.from_numpy(probability), torch.from_numpy(y[half:])).error
     print(
         f"held-back half: calibration error {error:.3f}; {sure.sum()} sure, {y[half:][sure].mean():.3f} of them right"
     )
