@@ -20,6 +20,7 @@ from idam.geometry import (
     random_rotation,
     rotation_angle,
     rotation_to_euler_zyx,
+    rotations_within,
     square_distance,
     weighted_procrustes,
 )
@@ -344,3 +345,13 @@ def test_gather_points_takes_rows_of_each_cloud(randn, generator):
     gathered = gather_points(values, index)
     for b in range(3):
         assert torch.equal(gathered[b], values[b][index[b]])
+
+
+@pytest.mark.parametrize("degrees", [75, 180])
+def test_rotations_are_uniform_up_to_the_largest_angle(degrees, generator):
+    angles = rotation_angle(rotations_within(20_000, math.radians(degrees), generator)).double().sort().values
+    angles = torch.deg2rad(angles) if angles.max() > math.pi else angles
+    limit = math.radians(degrees)
+    expected = (angles - angles.sin()) / (limit - math.sin(limit))
+    assert angles.max() <= limit + 1e-3
+    assert (expected - torch.linspace(0, 1, 20_000, dtype=torch.float64)).abs().max() < 0.02

@@ -23,6 +23,7 @@ __all__ = [
     "random_rotation",
     "rotation_angle",
     "rotation_to_euler_zyx",
+    "rotations_within",
     "square_distance",
     "weighted_procrustes",
 ]
@@ -87,6 +88,16 @@ def random_rotation(
 ) -> Tensor:
     """``count`` rotations (count, 3, 3) drawn uniformly from SO(3), from normalised Gaussian quaternions."""
     return quaternion_to_rotation(torch.randn(count, 4, generator=generator, dtype=dtype))
+
+
+def rotations_within(count: int, max_angle: float, generator: torch.Generator) -> Tensor:
+    """Rotations (count, 3, 3) about uniform axes, uniform in SO(3) up to an angle in radians."""
+    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    # the angle's distribution function in SO(3) is (a - sin a) / pi, inverted on a table
+    angles = torch.linspace(0, max_angle, 1024)
+    share = (angles - angles.sin()) / (max_angle - math.sin(max_angle))
+    angle = angles[torch.searchsorted(share, torch.rand(count, generator=generator)).clamp_max(1023)]
+    return quaternion_to_rotation(torch.cat([(angle / 2).cos()[:, None], axis * (angle / 2).sin()[:, None]], -1))
 
 
 def quaternion_to_rotation(quaternion: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
 """General pairs: the truth holds, every part of a scan's fate happens, and nothing else decides than the generator."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
@@ -9,7 +8,7 @@ import torch
 from idam.data import general
 from idam.data.general import POINTS, make_general_pairs
 from idam.data.pairs import Pairs
-from idam.geometry import apply_transform, nearest, rotation_angle
+from idam.geometry import apply_transform, nearest
 
 
 @pytest.fixture
@@ -56,16 +55,6 @@ def test_scans_are_centred_and_of_unit_size_as_in_use(shapes, generator):
         assert cloud.mean(1).norm(dim=-1).max() < 1e-5
     sizes = torch.stack([cloud.norm(dim=-1).quantile(0.98, dim=-1) for cloud in (pairs.source, pairs.target)])
     torch.testing.assert_close(sizes.amax(0), torch.ones(24))
-
-
-@pytest.mark.parametrize("degrees", [75, 180])
-def test_rotations_are_uniform_up_to_the_largest_angle(degrees, generator):
-    angles = rotation_angle(general._rotations(20_000, math.radians(degrees), generator)).double().sort().values
-    angles = torch.deg2rad(angles) if angles.max() > math.pi else angles
-    limit = math.radians(degrees)
-    expected = (angles - angles.sin()) / (limit - math.sin(limit))
-    assert angles.max() <= limit + 1e-3
-    assert (expected - torch.linspace(0, 1, 20_000, dtype=torch.float64)).abs().max() < 0.02
 
 
 @pytest.mark.parametrize(

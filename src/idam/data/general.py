@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from idam.data.pairs import Pairs
-from idam.geometry import gather_points, nearest_neighbours, quaternion_to_rotation
+from idam.geometry import gather_points, nearest_neighbours, quaternion_to_rotation, random_rotation, rotations_within
 
-__all__ = ["make_general_pairs"]
+__all__ = ["in_any_pose", "make_general_pairs"]
 
 POINTS = 640
 """Points of each cloud."""
@@ -49,10 +49,10 @@ def make_general_pairs(points: Tensor, generator: torch.Generator, max_angle: fl
         max_angle: largest angle of the rotation, radians; pi for all of SO(3).
     """
     count = len(points)
-    surface = _scenes(_turned(points, generator), generator)
+    surface = _scenes(in_any_pose(points, generator), generator)
     neighbours = nearest_neighbours(surface, NEIGHBOURS)
     source, target = (_scan(_sampled_anew(surface, neighbours, generator), generator) for _ in range(2))
-    rotation = _rotations(count, max_angle, generator)
+    rotation = rotations_within(count, max_angle, generator)
     # each cloud about its own mean, and both of unit size, as in use
     centres = [cloud.mean(1, keepdim=True) for cloud in (source, target)]
     source, target = source - centres[0], target - centres[1]
@@ -66,20 +66,9 @@ def _uniform(shape: tuple[int, ...], low: float, high: float, generator: torch.G
     return torch.rand(shape, generator=generator) * (high - low) + low
 
 
-def _turned(points: Tensor, generator: torch.Generator) -> Tensor:
-    """The shapes in any pose: in practice there is no common upright."""
-    rotation = quaternion_to_rotation(torch.randn(len(points), 4, generator=generator))
-    return points @ rotation.transpose(-1, -2)
-
-
-def _rotations(count: int, max_angle: float, generator: torch.Generator) -> Tensor:
-    """Rotations (count, 3, 3) about uniform axes, uniform in SO(3) up to an angle."""
-    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    # the angle's distribution function in SO(3) is (a - sin a) / pi, inverted on a table
-    angles = torch.linspace(0, max_angle, 1024)
-    share = (angles - angles.sin()) / (max_angle - math.sin(max_angle))
-    angle = angles[torch.searchsorted(share, torch.rand(count, generator=generator)).clamp_max(1023)]
-    return quaternion_to_rotation(torch.cat([(angle / 2).cos()[:, None], axis * (angle / 2).sin()[:, None]], -1))
+def in_any_pose(points: Tensor, generator: torch.Generator) -> Tensor:
+    """The shapes (B, N, 3), each turned in some way: in practice there is no common upright."""
+    return points @ random_rotation(len(points), generator=generator).transpose(-1, -2)
 
 
 def _scenes(points: Tensor, generator: torch.Generator) -> Tensor:

@@ -8,8 +8,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from idam.data.general import in_any_pose
 from idam.data.pairs import MAX_ANGLE, MAX_TRANSLATION, NOISE, NOISE_CLIP, Pairs, drawn_singly
-from idam.geometry import apply_transform, euler_xyz_to_rotation, gather_points, quaternion_to_rotation
+from idam.geometry import (
+    apply_transform,
+    euler_xyz_to_rotation,
+    gather_points,
+    quaternion_to_rotation,
+    rotations_within,
+)
 
 __all__ = ["KEPT", "fixed_practice_pairs", "make_practice_pairs"]
 
@@ -29,25 +36,31 @@ class _Draw:
     translation: Tensor
 
 
-def make_practice_pairs(points: Tensor, generator: torch.Generator, *, any_rotation: bool) -> Pairs:
+def make_practice_pairs(points: Tensor, generator: torch.Generator, max_angle: float | None = None) -> Pairs:
     """Pairs from whole shapes (B, N, 3), drawn from ``generator`` as one batch.
 
     Source and target are disjoint random halves of the shape's points, each cropped by a half-space of its own to 70 %
     (the points lowest along a random direction), with noise N(0, 0.01), clipped to +-0.05, on every coordinate; the
-    rotation is R = Rx Ry Rz with angles from U[0, 45] degrees, or uniform over SO(3); t from U[-0.5, 0.5]^3.
+    rotation is R = Rx Ry Rz with angles from U[0, 45] degrees, or about any axis; t from U[-0.5, 0.5]^3.
 
     Args:
         points: whole shapes (B, N, 3).
         generator: on the CPU.
-        any_rotation: all of SO(3).
+        max_angle: largest angle, radians, of a rotation uniform over SO(3), of shapes in any pose; None for the angles
+            above, of shapes as they are.
     """
-    return _build(points, _draw(len(points), points.shape[1], generator), any_rotation)
+    draw = _draw(len(points), points.shape[1], generator)
+    if max_angle is None:
+        return _build(points, draw, euler_xyz_to_rotation(draw.angles))
+    # a network that is started from many rotations sees the target in all of its poses
+    return _build(in_any_pose(points, generator), draw, rotations_within(len(points), max_angle, generator))
 
 
 def fixed_practice_pairs(points: Tensor, seed: int, *, any_rotation: bool) -> Pairs:
-    """Test pairs from whole shapes (B, N, 3): each depends on the seed and its index alone."""
+    """Test pairs from whole shapes (B, N, 3), turned little or in any way: each depends on the seed and its index."""
     drawn = drawn_singly(lambda generator: _draw(1, points.shape[1], generator), len(points), seed)
-    return _build(points, drawn, any_rotation)
+    rotation = quaternion_to_rotation(drawn.quaternion) if any_rotation else euler_xyz_to_rotation(drawn.angles)
+    return _build(points, drawn, rotation)
 
 
 def _draw(count: int, points: int, generator: torch.Generator) -> _Draw:
@@ -71,8 +84,7 @@ def _kept(points: int) -> int:
     return math.floor(KEPT * (points // 2))
 
 
-def _build(points: Tensor, draw: _Draw, any_rotation: bool) -> Pairs:
-    rotation = quaternion_to_rotation(draw.quaternion) if any_rotation else euler_xyz_to_rotation(draw.angles)
+def _build(points: Tensor, draw: _Draw, rotation: Tensor) -> Pairs:
     half = points.shape[1] // 2
     source, target = (
         _cropped(gather_points(points, order), direction, _kept(points.shape[1])) + noise

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.experiments import TestSet
-from idam.evaluation.methods import METHODS
+from idam.evaluation.methods import ABLATION, rows_of
 from idam.evaluation.methods.network import weights_for
 from idam.evaluation.record import Missing, read_rows, write_record
 from idam.evaluation.runner import LIMITS, Row, Task, run
@@ -32,7 +32,7 @@ def evaluate(
 
     Args:
         test: the pairs.
-        methods: names of the rows; None for all, of which those that cannot run here say why instead.
+        methods: names of the rows; None for all of the table, of which those that cannot run here say why instead.
         model: weights for the rows of the network; None for those that were trained for the experiment.
         settings: of the one method asked for.
         jobs: processes that share the pairs.
@@ -48,7 +48,7 @@ def evaluate(
         raise InputError("settings are of one method: give --set with one --method")
     if resume and output is None:
         raise InputError("give --resume with --json, the file to go on with")
-    tasks = [Task(name, _weights(name, model, test.name), tuple(settings)) for name in methods or METHODS]
+    tasks = [Task(name, _weights(name, model, test.name), tuple(settings)) for name in methods or rows_of(test.name)]
     if output is not None:
         check_destination(output)
     if methods is not None:
@@ -67,7 +67,7 @@ def evaluate(
 def _weights(method: str, model: str | None, experiment: str) -> str | None:
     """The weights of a row: those named go to every row that takes any."""
     if model is not None:
-        return model if "idam" in method or method == "register" else None
+        return model if "idam" in method or method in (*ABLATION, "register") else None
     return weights_for(method, experiment)
 
 

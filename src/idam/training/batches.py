@@ -9,7 +9,8 @@ from torch import Tensor
 
 from idam.data.general import make_general_pairs
 from idam.data.modelnet40 import Shapes
-from idam.data.pairs import Pairs, fixed_pairs, make_pairs
+from idam.data.pairs import EXPERIMENTS, Pairs, fixed_pairs, make_pairs
+from idam.data.practice import make_practice_pairs
 from idam.geometry import apply_transform
 from idam.network.elimination import share_of
 from idam.network.sampling import balanced_sample
@@ -38,10 +39,20 @@ def split_validation(shapes: Shapes, recipe: Recipe) -> tuple[Shapes, Pairs]:
     held = min(VALIDATION_SHAPES, max(1, len(shapes) // 10))
     train = Shapes(shapes.points[order[held:]], shapes.labels[order[held:]])
     points = shapes.points[order[:held]]
+    if recipe.experiment in EXPERIMENTS:
+        return train, fixed_pairs(points, VALIDATION_SEED, recipe.sigma)
+    return train, draw_pairs(points, recipe, torch.Generator().manual_seed(VALIDATION_SEED))
+
+
+def draw_pairs(points: Tensor, recipe: Recipe, generator: torch.Generator) -> Pairs:
+    """Pairs of whole shapes (B, N, 3) to train on."""
     if recipe.experiment == "general":
-        generator = torch.Generator().manual_seed(VALIDATION_SEED)
-        return train, make_general_pairs(points, generator, recipe.max_angle)
-    return train, fixed_pairs(points, VALIDATION_SEED, recipe.sigma)
+        return make_general_pairs(points, generator, recipe.max_angle)
+    if recipe.experiment == "practice":
+        return make_practice_pairs(points, generator)
+    if recipe.experiment == "practice-any-rotation":
+        return make_practice_pairs(points, generator, recipe.max_angle)
+    return make_pairs(points, generator, recipe.sigma)
 
 
 def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -> Batch:
@@ -51,10 +62,7 @@ def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -
     order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
     rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
     generator = torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
-    if recipe.experiment == "general":
-        pairs = make_general_pairs(shapes.points[rows], generator, recipe.max_angle)
-    else:
-        pairs = make_pairs(shapes.points[rows], generator, recipe.sigma)
+    pairs = draw_pairs(shapes.points[rows], recipe, generator)
     aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
     count = share_of(pairs.source.shape[1], recipe.keep)
     source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)

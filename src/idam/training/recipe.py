@@ -11,8 +11,8 @@ from idam.network.config import Config
 
 __all__ = ["TRAININGS", "Recipe", "check"]
 
-TRAININGS = (*EXPERIMENTS, "general")
-"""What a model can be trained for: the paper's experiments, or pairs as practice has them."""
+TRAININGS = (*EXPERIMENTS, "practice", "practice-any-rotation", "general")
+"""What a model can be trained for: the paper's experiments, disjoint halves, or pairs as practice has them."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Recipe:
         learning_rate: Adam's, at its highest.
         weight_decay: Adam's.
         radius: r of the loss and of balanced sampling.
-        noise: sigma of the noise on both clouds; None for the experiment's own. ``general`` draws its own.
+        noise: sigma of the noise on both clouds; None for the experiment's own. Practice draws its own.
         keep: share of points that balanced sampling draws.
         iterations: iterations of a training step; the configuration's are those after training.
         eliminate: let hard elimination choose the target points, and half of the source points, as it does after
@@ -60,7 +60,7 @@ class Recipe:
 
     @property
     def max_angle(self) -> float:
-        """Largest angle of a general pair: FPFH cannot tell, and GNN features get a start near enough in use."""
+        """Largest angle of pairs turned in any way: FPFH cannot tell, and GNN features get a near start in use."""
         return math.pi if self.config.features == "fpfh" else math.radians(75)
 
     def rate(self, progress: float) -> float:

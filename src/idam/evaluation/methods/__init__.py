@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 
-__all__ = ["METHODS", "Method", "build_method"]
+__all__ = ["ABLATION", "METHODS", "Method", "build_method", "rows_of"]
 
 Method = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float64]]
 """Source (P, 3) and target (Q, 3) to the transform (4, 4) that lays the source on the target."""
 
 PAPER = ("iterations=3", f"keep={1 / 6}", "keep_again=", "keep_matches=0.5", "soft_matches=false")
 """The paper's inference, whatever a model's own."""
+
+ABLATION = ("ablation-bs", "ablation-sm", "ablation-ha-sm", "ablation-full")
+"""Rows of the ablation (section 4.6): the baseline, and one part more with each."""
 
 METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "icp": ("classical:icp", ()),
@@ -35,8 +38,14 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "fpfh-idam": ("network:fpfh", ()),
     "gnn-idam": ("network:gnn", ()),
     "register": ("pipeline:build", ()),
+    **dict.fromkeys(ABLATION, ("network:ablation", PAPER)),
 }
 """The function that makes each method, in a module beside this one, and the settings of its row."""
+
+
+def rows_of(table: str) -> list[str]:
+    """Names of the methods that make up a table."""
+    return [name for name in METHODS if (name in ABLATION) == (table == "ablation")]
 
 
 def build_method(name: str, model: str | None = None, settings: Sequence[str] = ()) -> Method:

@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 
 from idam.errors import InputError
-from idam.evaluation.methods import Method
+from idam.evaluation.methods import ABLATION, Method
 from idam.network.pretrained import list_models, load_model
 from idam.settings import with_settings
 
-__all__ = ["fpfh", "gnn", "weights_for"]
+__all__ = ["ablation", "fpfh", "gnn", "weights_for"]
 
 
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
@@ -26,10 +26,26 @@ def fpfh(model: str | None, settings: Sequence[str]) -> Method:
     return _alone(model or "fpfh-unseen-shapes", settings)
 
 
+def ablation(model: str | None, settings: Sequence[str]) -> Method:
+    """A network with parts of the paper taken out, which it must have been trained without.
+
+    Raises:
+        InputError: no model is named.
+    """
+    if model is None:
+        raise InputError("name the model, such as gnn-ablation-bs: a row of the ablation has weights of its own")
+    return _alone(model, settings)
+
+
 def weights_for(method: str, experiment: str | None) -> str | None:
     """The shipped weights trained for an experiment, where the method is the network alone and there are any."""
-    name = f"{method.split('-')[0]}-{experiment}"
-    return name if "-idam" in method and name in list_models() else None
+    if method in ABLATION:
+        name = f"gnn-{method}"
+    elif "-idam" in method:
+        name = f"{method.split('-')[0]}-{experiment}"
+    else:
+        return None
+    return name if name in list_models() else None
 
 
 def _alone(model: str, settings: Sequence[str]) -> Method:
