@@ -89,9 +89,3 @@ def test_go_icp_is_named_with_the_command_that_brings_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "py_simple_go_icp_interface.main", None)
     with pytest.raises(MissingDependencyError, match=r"g\+\+.*pip install 'idam\[benchmark\]'"):
         build_method("go-icp")
-
-
-@pytest.mark.parametrize("name", ["pointnetlk", "dcp", "prnet"])
-def test_the_learned_rivals_have_their_place_and_say_that_they_are_not_there_yet(name):
-    with pytest.raises(MissingDependencyError, match="not yet"):
-        build_method(name)

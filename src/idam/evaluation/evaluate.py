@@ -7,7 +7,7 @@ from pathlib import Path
 
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.experiments import TestSet
-from idam.evaluation.methods import ABLATION, rows_of
+from idam.evaluation.methods import ABLATION, RIVALS, rows_of
 from idam.evaluation.methods.network import weights_for
 from idam.evaluation.record import Missing, read_rows, write_record
 from idam.evaluation.runner import LIMITS, Row, Task, run
@@ -33,7 +33,7 @@ def evaluate(
     Args:
         test: the pairs.
         methods: names of the rows; None for all of the table, of which those that cannot run here say why instead.
-        model: weights for the rows of the network; None for those that were trained for the experiment.
+        model: weights for the rows that take any; None for those that were trained for the experiment.
         settings: of the one method asked for.
         jobs: processes that share the pairs.
         output: JSON file, written after each row.
@@ -67,7 +67,7 @@ def evaluate(
 def _weights(method: str, model: str | None, experiment: str) -> str | None:
     """The weights of a row: those named go to every row that takes any."""
     if model is not None:
-        return model if "idam" in method or method in (*ABLATION, "register") else None
+        return model if "idam" in method or method in (*ABLATION, *RIVALS, "register") else None
     return weights_for(method, experiment)
 
 

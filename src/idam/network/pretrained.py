@@ -7,21 +7,29 @@ import os
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor, nn
 
 from idam.errors import InputError
 from idam.io.files import write_bytes
 from idam.network.config import Config
 from idam.network.model import IDAM
 
-__all__ = ["list_models", "load_model", "provenance", "save_model"]
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+__all__ = ["UNREADABLE", "list_models", "load_model", "provenance", "read_weights", "save_model", "save_weights"]
 
 DEFAULT = "gnn-gaussian-noise-light"
 """The model behind the name ``default``: on real scans, noise in training counts for more than exact matches."""
+
+
+UNREADABLE = (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError)
+"""What reading weights raises where the file is something else or of another network."""
 
 
 def list_models() -> list[str]:
@@ -41,12 +49,10 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
     """
     path = find(name)
     try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-        model = IDAM(Config(**_config(metadata)))
+        config, state = read_weights(path)
+        model = IDAM(Config(**config))
         model.load_state_dict(state)
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except UNREADABLE as error:
         reason = str(error).splitlines()[0][:120]
         raise InputError(f"{path}: not a model that idam wrote ({reason}); use one of {_names()}") from None
     try:
@@ -73,9 +79,26 @@ def save_model(path: Path, model: IDAM, provenance: dict[str, Any]) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
-    metadata = {"config": json.dumps(asdict(model.config)), "provenance": json.dumps(provenance)}
+    save_weights(path, model, model.config, provenance)
+
+
+def save_weights(path: Path, network: nn.Module, config: DataclassInstance, provenance: dict[str, Any]) -> None:
+    """Write any network's weights, configuration and provenance to one file, atomically.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
+    metadata = {"config": json.dumps(asdict(config)), "provenance": json.dumps(provenance)}
     write_bytes(path, save(state, metadata))
+
+
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The configuration and the weights that :func:`save_weights` wrote; raise one of UNREADABLE where it did not."""
+    with safe_open(path, "pt") as file:
+        metadata = file.metadata() or {}
+        state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+    return _config(metadata), state
 
 
 def find(name: str | os.PathLike[str]) -> Path:

@@ -16,7 +16,7 @@ from idam.network.elimination import share_of
 from idam.network.sampling import balanced_sample
 from idam.training.recipe import Recipe
 
-__all__ = ["Batch", "batch_at", "split_validation"]
+__all__ = ["Batch", "batch_at", "generator_at", "pairs_at", "split_validation"]
 
 VALIDATION_SHAPES = 200
 VALIDATION_SEED = 7
@@ -57,13 +57,25 @@ def draw_pairs(points: Tensor, recipe: Recipe, generator: torch.Generator) -> Pa
 
 def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -> Batch:
     """The pairs and sampled points of one process at one step, a function of the seed and the step alone."""
-    per_epoch = len(shapes) // recipe.batch_size
-    epoch, position = divmod(step, per_epoch)
-    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
-    rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
-    generator = torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
-    pairs = draw_pairs(shapes.points[rows], recipe, generator)
+    generator = generator_at(recipe, step, rank)
+    pairs = pairs_at(shapes, recipe, step, generator, rank, world)
     aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
     count = share_of(pairs.source.shape[1], recipe.keep)
     source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)
     return Batch(pairs.source, pairs.target, pairs.rotation, pairs.translation, source_index, target_index)
+
+
+def generator_at(recipe: Recipe, step: int, rank: int = 0) -> torch.Generator:
+    """What all that is random about one process's step is drawn from, the pairs first."""
+    return torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
+
+
+def pairs_at(
+    shapes: Shapes, recipe: Recipe, step: int, generator: torch.Generator, rank: int = 0, world: int = 1
+) -> Pairs:
+    """The pairs of one process at one step, drawn from its generator."""
+    per_epoch = len(shapes) // recipe.batch_size
+    epoch, position = divmod(step, per_epoch)
+    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
+    rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
+    return draw_pairs(shapes.points[rows], recipe, generator)

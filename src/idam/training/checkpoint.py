@@ -12,6 +12,7 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
+from torch import nn
 
 from idam.errors import InputError
 from idam.evaluation.metrics import Metrics
@@ -19,7 +20,6 @@ from idam.io.files import one_line, write_bytes
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model
 from idam.training.recipe import Recipe
-from idam.training.step import SupervisedStep
 
 __all__ = ["Progress", "history", "initial_model", "restore", "save_checkpoint"]
 
@@ -48,12 +48,14 @@ def initial_model(recipe: Recipe) -> IDAM:
     return model
 
 
-def history(recipe: Recipe, progress: Progress, scores: Metrics, pairs: int, command: str) -> dict[str, Any]:
+def history(
+    experiment: str, options: dict[str, Any], progress: Progress, scores: Metrics, pairs: int, command: str
+) -> dict[str, Any]:
     """The provenance of a model: what it was trained on, how far, and how it did on the validation pairs."""
     return {
-        "experiment": recipe.experiment,
+        "experiment": experiment,
         "data": "ModelNet40, 1024 points a shape, training split less the validation shapes",
-        "recipe": {key: value for key, value in asdict(recipe).items() if key != "config"},
+        "recipe": options,
         "steps": progress.step,
         "training_seconds": round(progress.seconds),
         "validation": {key: round(value, 5) for key, value in scores.to_dict().items()},
@@ -83,28 +85,28 @@ def commit() -> str:
 
 
 def save_checkpoint(
-    path: Path, module: SupervisedStep, optimizer: torch.optim.Optimizer, progress: Progress, recipe: Recipe
+    path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress, options: dict[str, Any]
 ) -> None:
     """Write everything needed to go on, atomically."""
     state = {
-        "model": module.model.state_dict(),
+        "model": model.state_dict(),
         "optimizer": optimizer.state_dict(),
         "progress": asdict(progress),
-        "recipe": json.dumps(asdict(recipe)),
+        "recipe": json.dumps(options),
     }
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())
 
 
-def restore(path: Path, module: SupervisedStep, optimizer: torch.optim.Optimizer, recipe: Recipe) -> Progress:
-    """Load a checkpoint, if there is one; raise InputError where it is another recipe's."""
+def restore(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, options: dict[str, Any]) -> Progress:
+    """Load a checkpoint, if there is one; raise InputError where it was trained with other options."""
     if not path.is_file():
         return Progress()
     state = read_checkpoint(path)
-    if json.loads(state["recipe"]) != json.loads(json.dumps(asdict(recipe))):
+    if json.loads(state["recipe"]) != json.loads(json.dumps(options)):
         raise InputError(f"{path}: was trained with other options; give the same ones, or another --output")
-    module.model.load_state_dict(state["model"])
+    model.load_state_dict(state["model"])
     optimizer.load_state_dict(state["optimizer"])
     return Progress(**state["progress"])
 

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Protocol
+
+from torch import Tensor
 
 from idam.evaluation.metrics import Metrics
-from idam.network.supervision import Loss
 
-__all__ = ["Log"]
+__all__ = ["Log", "Parts"]
+
+
+class Parts(Protocol):
+    """A loss by its parts: a named tuple of tensors, and the sum that is minimised."""
+
+    @property
+    def total(self) -> Tensor:
+        """The sum that is minimised."""
+
+    def _asdict(self) -> dict[str, Any]: ...
 
 
 class Log:
@@ -38,18 +50,13 @@ class Log:
         if self.writer is not None:
             self.writer.close()
 
-    def step(self, step: int, loss: Loss) -> None:
-        """Show the parts of one step's loss."""
+    def step(self, step: int, loss: Parts, done: int | None = None) -> None:
+        """Show the parts of one step's loss, and how much of the total is done: the steps, unless told otherwise."""
         if self.writer is None:
             return
-        figures = {
-            "matching": loss.matching.item(),
-            "entropy": loss.entropy.item(),
-            "elimination": loss.elimination.item(),
-            "accuracy": loss.accuracy.item(),
-        }
+        figures = {name: value.item() for name, value in loss._asdict().items()}
         text = " ".join(f"{name} {value:.3f}" for name, value in figures.items())
-        self.bar.update(self.task, completed=step + 1, description=text)
+        self.bar.update(self.task, completed=step + 1 if done is None else done, description=text)
         if step % 10 == 0:
             for name, value in figures.items():
                 self.writer.add_scalar(f"train/{name}", value, step)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from idam.data.modelnet40 import experiment_shapes
 from idam.data.pairs import Pairs
@@ -14,7 +16,6 @@ from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.metrics import Metrics, measure
 from idam.io import make_folder
 from idam.memory import keep_freed_memory
-from idam.network.model import IDAM
 from idam.network.pretrained import save_model
 from idam.network.supervision import Loss
 from idam.training.batches import batch_at, split_validation
@@ -56,13 +57,9 @@ def train(
         InputError: the data, the output folder or the recipe cannot be used.
         MissingDependencyError: the ``train`` extra is not installed.
     """
-    try:
-        from lightning_fabric import Fabric
-        from torch.utils.tensorboard import SummaryWriter  # noqa: F401 - for the log
-    except ImportError as error:
-        raise MissingDependencyError(
-            "training needs Lightning Fabric and TensorBoard: pip install 'idam[train]'"
-        ) from error
+    check_installed()
+    from lightning_fabric import Fabric
+
     check(recipe)
     check_run(device, precision, validate_every)
     output = make_folder(output)
@@ -79,7 +76,8 @@ def train(
     total = max(1, round(recipe.epochs * (len(shapes) // recipe.batch_size)))
     module = SupervisedStep(initial_model(recipe), recipe, precision)
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-    progress = restore(output / "last.ckpt", module, optimizer, recipe) if resume else Progress()
+    progress = restore(output / "last.ckpt", module.model, optimizer, asdict(recipe)) if resume else Progress()
+    options = {name: value for name, value in asdict(recipe).items() if name != "config"}
     step_module, step_optimizer = fabric.setup(module, optimizer)
     started = time.monotonic() - progress.seconds
     with Log(output, total, progress.step, enabled=fabric.is_global_zero) as log:
@@ -103,16 +101,16 @@ def train(
                         save_model(
                             output / "best.safetensors",
                             module.model,
-                            history(recipe, progress, scores, len(validation), command),
+                            history(recipe.experiment, options, progress, scores, len(validation), command),
                         )
-                    save_checkpoint(output / "last.ckpt", module, optimizer, progress, recipe)
+                    save_checkpoint(output / "last.ckpt", module.model, optimizer, progress, asdict(recipe))
                 fabric.barrier()
     return output / "best.safetensors"
 
 
 @torch.inference_mode()
-def validate(model: IDAM, pairs: Pairs, batch_size: int = 50) -> Metrics:
-    """Errors of the network alone on pairs."""
+def validate(model: nn.Module, pairs: Pairs, batch_size: int = 50) -> Metrics:
+    """Errors of the network alone on pairs; its output has a rotation and a translation."""
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
     estimates = []
@@ -123,6 +121,17 @@ def validate(model: IDAM, pairs: Pairs, batch_size: int = 50) -> Metrics:
     model.train(was_training)
     rotation, translation = (torch.cat(parts) for parts in zip(*estimates, strict=True))
     return measure(rotation, translation, pairs.rotation, pairs.translation)
+
+
+def check_installed() -> None:
+    """Raise MissingDependencyError where the ``train`` extra is not installed."""
+    try:
+        import lightning_fabric  # noqa: F401
+        from torch.utils.tensorboard import SummaryWriter  # noqa: F401 - for the log
+    except ImportError as error:
+        raise MissingDependencyError(
+            "training needs Lightning Fabric and TensorBoard: pip install 'idam[train]'"
+        ) from error
 
 
 def check_run(device: str, precision: str, validate_every: int) -> None:
@@ -147,7 +156,7 @@ def check_batch(batch_size: int, shapes: int, processes: int) -> None:
         raise InputError(f"{processes} processes cannot share a batch of {batch_size}: choose a larger --batch-size")
 
 
-def check_finite(module: SupervisedStep, step: int) -> None:
+def check_finite(module: nn.Module, step: int) -> None:
     """Raise InputError where the training has diverged: weights that are no numbers answer identity, which scores."""
     if not all(parameter.isfinite().all() for parameter in module.parameters()):
         raise InputError(f"the training has diverged by step {step + 1}: choose a smaller --learning-rate")

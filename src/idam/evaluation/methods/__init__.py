@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 
-__all__ = ["ABLATION", "METHODS", "Method", "build_method", "rows_of"]
+__all__ = ["ABLATION", "METHODS", "RIVALS", "Method", "build_method", "rows_of"]
 
 Method = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float64]]
 """Source (P, 3) and target (Q, 3) to the transform (4, 4) that lays the source on the target."""
@@ -21,6 +21,9 @@ PAPER = ("iterations=3", f"keep={1 / 6}", "keep_again=", "keep_matches=0.5", "so
 ABLATION = ("ablation-bs", "ablation-sm", "ablation-ha-sm", "ablation-full")
 """Rows of the ablation (section 4.6): the baseline, and one part more with each."""
 
+RIVALS = ("pointnetlk", "dcp", "prnet")
+"""The learned methods of others, which ``benchmarks/train_rival.py`` trains."""
+
 METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "icp": ("classical:icp", ()),
     "go-icp": ("go_icp:build", ()),
@@ -30,9 +33,9 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "fpfh-ransac-tuned": ("classical:ransac", ("ransac_distance=0.02",)),
     "fpfh-ransac-icp-tuned": ("classical:ransac", ("icp_after=0.05",)),
     "kiss-matcher": ("kiss:build", ()),
-    "pointnetlk": ("pending:build", ()),
-    "dcp": ("pending:build", ()),
-    "prnet": ("pending:build", ()),
+    "pointnetlk": ("pointnetlk:build", ()),
+    "dcp": ("dcp:build", ()),
+    "prnet": ("prnet:build", ()),
     "fpfh-idam-paper": ("network:fpfh", PAPER),
     "gnn-idam-paper": ("network:gnn", PAPER),
     "fpfh-idam": ("network:fpfh", ()),
@@ -58,7 +61,7 @@ def build_method(name: str, model: str | None = None, settings: Sequence[str] = 
 
     Raises:
         InputError: no method, model or setting has that name.
-        MissingDependencyError: what the method stands on is not installed, or the method is not there yet.
+        MissingDependencyError: what the method stands on is not installed, or its weights are not there.
     """
     if name not in METHODS:
         raise InputError(f"unknown method {name!r}: choose {', '.join(METHODS)}")

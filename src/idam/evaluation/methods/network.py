@@ -7,13 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from idam.errors import InputError
-from idam.evaluation.methods import ABLATION, Method
+from idam.evaluation.methods import ABLATION, RIVALS, Method
+from idam.evaluation.methods.learned.weights import rival_weights_for
 from idam.network.pretrained import list_models, load_model
 from idam.settings import with_settings
 
-__all__ = ["ablation", "fpfh", "gnn", "weights_for"]
+__all__ = ["ablation", "as_method", "fpfh", "gnn", "weights_for"]
 
 
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
@@ -38,7 +40,9 @@ def ablation(model: str | None, settings: Sequence[str]) -> Method:
 
 
 def weights_for(method: str, experiment: str | None) -> str | None:
-    """The shipped weights trained for an experiment, where the method is the network alone and there are any."""
+    """The weights trained for an experiment, where the method is a rival, or the network alone and there are any."""
+    if method in RIVALS:
+        return rival_weights_for(method, experiment)
     if method in ABLATION:
         name = f"gnn-{method}"
     elif "-idam" in method:
@@ -51,6 +55,11 @@ def weights_for(method: str, experiment: str | None) -> str | None:
 def _alone(model: str, settings: Sequence[str]) -> Method:
     network = load_model(model)
     network.config = with_settings(network.config, settings)
+    return as_method(network)
+
+
+def as_method(network: nn.Module) -> Method:
+    """A network whose output for (1, N, 3) and (1, M, 3) has a rotation and a translation, as a method."""
 
     @torch.inference_mode()
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -1,0 +1,1 @@
+"""What the learned rivals share: their interface, weights, features and layers."""
