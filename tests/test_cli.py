@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -122,7 +123,7 @@ def test_register_from_end_to_end(work: Path, result: RegistrationResult) -> Non
     assert files_in(work).keys() == before.keys() | set(outputs.values())
     assert all((work / name).read_bytes() == content for name, content in before.items())
     content = json.loads((work / "result.json").read_text())
-    assert run.code == (0 if content["confidence"] >= 0.5 else 1)
+    assert run.code == (0 if result.converged else 1)
     matrix = read_transform(work / "T.txt")
     np.testing.assert_allclose(matrix, result.transformation, atol=1e-6)
     np.testing.assert_array_equal(printed_matrix(run.out), matrix)
@@ -147,16 +148,86 @@ def test_register_writes_nothing_unasked(work: Path, call: Call, calls: list[Any
     assert files_in(work) == before
 
 
-@pytest.mark.parametrize(("confidence", "code"), [(0.0, 1), (0.49, 1), (0.51, 0), (1.0, 0)])
-def test_exit_code_is_the_confidence(
-    work: Path, call: Call, result: RegistrationResult, monkeypatch: pytest.MonkeyPatch, confidence: float, code: int
+@pytest.mark.parametrize(("converged", "code"), [(True, 0), (False, 1)])
+@pytest.mark.parametrize("quiet", [[], ["-q"]])
+def test_exit_code_says_whether_it_converged(
+    work: Path,
+    call: Call,
+    result: RegistrationResult,
+    monkeypatch: pytest.MonkeyPatch,
+    converged: bool,
+    code: int,
+    quiet: list[str],
 ) -> None:
-    monkeypatch.setattr(registration, "register", lambda *_, **__: replace(result, confidence=confidence))
-    run = call("register", "source.ply", "target.xyz", "-o", "aligned.ply")
+    monkeypatch.setattr(registration, "register", lambda *_, **__: replace(result, converged=converged))
+    run = call("register", "source.ply", "target.xyz", "-o", "aligned.ply", *quiet)
     assert run.code == code
     assert run.err == ""
     np.testing.assert_array_equal(printed_matrix(run.out), result.transformation)
     assert (work / "aligned.ply").exists()
+
+
+@pytest.mark.parametrize("reason", ["", "two poses explain the data equally well"])
+def test_reason_is_printed_where_there_is_one(
+    work: Path, call: Call, result: RegistrationResult, monkeypatch: pytest.MonkeyPatch, reason: str
+) -> None:
+    monkeypatch.setattr(registration, "register", lambda *_, **__: replace(result, reason=reason))
+    run = call("register", "source.ply", "target.xyz")
+    assert ("reason" in run.out) == bool(reason)
+    assert reason in run.out
+
+
+@pytest.mark.parametrize("option", ["-q", "--quiet"])
+def test_quiet_prints_the_matrix_alone(
+    work: Path, call: Call, calls: list[Any], result: RegistrationResult, option: str
+) -> None:
+    run = call("register", "source.ply", "target.xyz", option)
+    assert (run.out, run.err) == (format_transform(result.transformation) + "\n", "")
+
+
+@pytest.mark.parametrize("option", ["-v", "--verbose"])
+def test_verbose_tells_the_steps_on_stderr(
+    work: Path, call: Call, result: RegistrationResult, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    log = logging.getLogger("idam.registration")
+
+    def register(*_: Any, **__: Any) -> RegistrationResult:
+        log.info("voxel grids: %d points", 1024)
+        log.debug("not this")
+        return result
+
+    monkeypatch.setattr(registration, "register", register)
+    assert call("register", "source.ply", "target.xyz", "-q").err == ""
+    run = call("register", "source.ply", "target.xyz", "-q", option)
+    assert run.err == "voxel grids: 1024 points\n"
+    assert run.out == format_transform(result.transformation) + "\n"
+    assert call("register", "source.ply", "target.xyz", "-q").err == ""  # as before
+
+
+@pytest.mark.parametrize(("name", "start"), [("look.png", b"\x89PNG"), ("look.SVG", b"<?xml")])
+def test_plot_is_saved_by_its_extension(work: Path, call: Call, calls: list[Any], name: str, start: bytes) -> None:
+    pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
+    before = files_in(work)
+    run = call("register", "source.ply", "target.xyz", "--save-plot", name)
+    assert run.err == ""
+    assert files_in(work).keys() == before.keys() | {name}
+    assert (work / name).read_bytes().startswith(start)
+
+
+@pytest.mark.parametrize("name", ["look.jpg", "look"])
+def test_refuses_a_plot_it_cannot_draw(work: Path, call: Call, calls: list[Any], name: str) -> None:
+    assert_refused(call("register", "source.ply", "target.xyz", "--save-plot", name), name, ".png, .svg")
+    assert calls == []
+
+
+def test_plot_without_matplotlib_names_the_pip_command(
+    work: Path, call: Call, calls: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "find_spec", lambda _: None)
+    assert_refused(
+        call("register", "source.ply", "target.xyz", "--save-plot", "look.png"), "pip install 'idam[figures]'"
+    )
+    assert calls == []
 
 
 def test_options_reach_the_registration(work: Path, call: Call, calls: list[dict[str, Any]]) -> None:
@@ -248,7 +319,7 @@ def test_refuses_options(work: Path, call: Call, option: str, value: str, words:
     assert files_in(work) == before
 
 
-OUTPUTS = {"-o": "a.ply", "--transform": "a.txt", "--json": "a.json", "--html": "a.html"}
+OUTPUTS = {"-o": "a.ply", "--transform": "a.txt", "--json": "a.json", "--html": "a.html", "--save-plot": "a.png"}
 
 
 def all_outputs_but(option: str, value: Any) -> list[Any]:
@@ -377,6 +448,7 @@ def test_help_names_every_command_and_option(call: Call, monkeypatch: pytest.Mon
     run = call("register", "--help")
     assert (run.code, run.err) == (0, "")
     options = "--output -o --transform --json --html --model --init --voxel-size --max-correspondence-distance --refine"
+    options += " --save-plot --quiet -q --verbose -v"
     assert set(options.split()) <= set(run.out.replace(",", " ").split())
     assert "idam register scan1.ply scan2.ply" in run.out
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -21,8 +23,6 @@ __all__ = ["main"]
 
 UNSURE = 1
 BAD_INPUT = 2
-CONFIDENT = 0.5
-"""Confidence below which ``idam register`` exits with 1."""
 
 app = typer.Typer(
     name="idam",
@@ -78,6 +78,9 @@ def register(
     transform: Annotated[Path | None, typer.Option(help="Write the 4x4 here.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the whole result here.")] = None,
     html: Annotated[Path | None, typer.Option(help="Write a page to look at the result, opens offline.")] = None,
+    save_plot: Annotated[
+        Path | None, typer.Option(help="Draw the result as .png or .svg; needs idam[figures].")
+    ] = None,
     model: Annotated[str, typer.Option(help="Name or file of the weights; see 'idam models'.")] = "default",
     init: Annotated[Path | None, typer.Option(help="File of a 4x4 to start from.")] = None,
     voxel_size: Annotated[
@@ -89,6 +92,10 @@ def register(
     refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point or none.")] = "gicp",
     seed: Annotated[int, typer.Option(help="Of the starting rotations.")] = 0,
     device: Annotated[str, typer.Option(help="Where the network runs.")] = "cpu",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the 4x4 alone, for scripts.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on stderr what each step did and took.")
+    ] = False,
 ) -> None:
     """Lay SOURCE on TARGET: print the transform and how sure it is.
 
@@ -100,6 +107,8 @@ def register(
       idam register scan1.ply scan2.ply
 
       idam register scan1.ply scan2.ply -o aligned.ply --transform T.txt --html look.html
+
+      idam register scan1.ply scan2.ply -q > T.txt && echo "sure enough"
     """
     from idam import registration
     from idam.io import (
@@ -114,21 +123,24 @@ def register(
     # before the work, and before the first of them is written
     if output is not None:
         check_writable(output)
-    for path in (transform, json, html):
+    for path in (transform, json, html, save_plot):
         if path is not None:
             check_destination(path)
+    if save_plot is not None:
+        check_drawable(save_plot)
     source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
-    result = registration.register(
-        source_cloud,
-        target_cloud,
-        model=model,
-        init=None if init is None else read_transform(init),
-        voxel_size=voxel_size,
-        max_correspondence_distance=max_correspondence_distance,
-        refine=refine,
-        seed=seed,
-        device=device,
-    )
+    with steps_told(verbose):
+        result = registration.register(
+            source_cloud,
+            target_cloud,
+            model=model,
+            init=None if init is None else read_transform(init),
+            voxel_size=voxel_size,
+            max_correspondence_distance=max_correspondence_distance,
+            refine=refine,
+            seed=seed,
+            device=device,
+        )
     if output is not None:
         write_point_cloud(output, source_cloud.transformed(result.transformation))
     if transform is not None:
@@ -139,19 +151,51 @@ def register(
         from idam.report import write_report
 
         write_report(html, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
-    show(result)
-    if result.confidence < CONFIDENT:
+    if save_plot is not None:
+        from idam.figures.plot_result import write_plot
+
+        write_plot(save_plot, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
+    show(result, quiet)
+    if not result.converged:
         raise typer.Exit(UNSURE)
 
 
-def show(result: RegistrationResult) -> None:
-    """Print a result: the 4x4 as CloudCompare takes it, then the figures."""
+def check_drawable(path: Path) -> None:
+    """Find out before the work whether a picture can be drawn there."""
+    if path.suffix.lower() not in (".png", ".svg"):
+        raise InputError(f"{path}: unknown picture format '{path.suffix}': the ones to draw are .png, .svg")
+    if find_spec("matplotlib") is None:
+        raise MissingDependencyError("drawing a result needs Matplotlib: pip install 'idam[figures]'")
+
+
+@contextmanager
+def steps_told(verbose: bool) -> Iterator[None]:
+    """Write what the steps log to stderr, if that is asked for."""
+    log, handler = logging.getLogger("idam"), logging.StreamHandler()
+    level = log.level
+    if verbose:
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+
+
+def show(result: RegistrationResult, quiet: bool = False) -> None:
+    """Print a result: the 4x4 as CloudCompare takes it, then, unless quiet, the figures and why."""
     from idam.io import format_transform
 
     print(format_transform(result.transformation))
+    if quiet:
+        return
     print(f"fitness     {result.fitness:.3f}  (within {result.max_correspondence_distance:.4g})")
     print(f"inlier RMSE {result.inlier_rmse:.4g}")
     print(f"confidence  {result.confidence:.2f}")
+    if result.reason:
+        print(f"reason      {result.reason}")
     print(f"time        {result.seconds:.2f} s")
 
 
@@ -176,7 +220,7 @@ def models() -> None:
 
 @app.command()
 def train(
-    experiment: Annotated[str, typer.Argument(help="unseen-shapes, unseen-categories, gaussian-noise or general.")],
+    experiment: Annotated[str, typer.Argument(help="For what: a table of 'evaluate', or general.")],
     data: Data,
     features: Annotated[str, typer.Option(help="Point features: gnn or fpfh.")] = "gnn",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the weights and the log.")] = None,
@@ -191,6 +235,7 @@ def train(
         bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
     ] = False,
     radius: Annotated[float, typer.Option(help="Distance within which points match.")] = 0.05,
+    keep: Annotated[float, typer.Option(help="Share of points that balanced sampling draws.")] = 1 / 6,
     noise: Annotated[
         float | None, typer.Option(help="Sigma of the noise on both clouds; the experiment's own if left out.")
     ] = None,
@@ -229,6 +274,7 @@ def train(
         start=start,
         eliminate=eliminate,
         radius=radius,
+        keep=keep,
         noise=noise,
         seed=seed,
     )

@@ -10,6 +10,7 @@ import html
 import json
 import math
 import re
+from dataclasses import asdict
 from importlib import resources
 from os import PathLike
 from typing import Any
@@ -17,8 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from idam.confidence import CONVERGED
 from idam.io import PointCloud, write_text
 from idam.result import Matches, RegistrationResult
+from idam.view import approach, chance, frame, guess_up, sample
 
 __all__ = ["MAX_POINTS", "write_report"]
 
@@ -31,10 +34,21 @@ _STEPS = 65535
 _VERDICTS = (
     (0.9, "high", "The clouds are very likely aligned."),
     (0.7, "fair", "The clouds are probably aligned; a look at the picture settles it."),
-    (0.4, "fair", "The clouds may be misaligned: check the picture before using the transform."),
+    (CONVERGED, "fair", "The clouds may be misaligned: check the picture before using the transform."),
     (0.0, "low", "The clouds are probably misaligned: do not use the transform unchecked."),
 )
 """From this confidence on: the style of the bar, and what it means."""
+
+_EVIDENCE = {
+    "overlap": "Agreement of the clouds where they lie on each other, 0 to 1",
+    "margin": "By how much that exceeds the next best answer’s",
+    "support": "Share of the matches’ weight that agrees with the answer",
+    "stiffness": "How firmly the surfaces hold each other, 0 where they slide or turn",
+}
+"""What the fields of :class:`idam.confidence.Evidence` are called on the page."""
+
+RUNNERS_UP = 3
+"""Other answers a page names at most."""
 
 _Rows = list[tuple[str, str]]
 
@@ -64,23 +78,25 @@ def write_report(
     Raises:
         InputError: the file cannot be written.
     """
-    shown = _sample(source.points), _sample(target.points)
+    shown = sample(source.points, MAX_POINTS), sample(target.points, MAX_POINTS)
     template = resources.files("idam").joinpath("report_page.html").read_text(encoding="utf-8")
     level, verdict = _verdict(result.confidence)
     page = _fill(
         template,
         source_name=_escape(source_name),
         target_name=_escape(target_name),
-        confidence=_escape(_chance(result.confidence)),
+        confidence=_escape(chance(result.confidence)),
         confidence_percent=f"{100 * result.confidence:.1f}",
         level=level,
         verdict=verdict,
+        reason=_escape(f"{result.reason[:1].upper()}{result.reason[1:]}." if result.reason else ""),
         headlines=_headlines(result),
         matrix=_matrix(result.transformation),
         matrix_text=_escape("\n".join(" ".join(map(repr, row)) for row in result.transformation.tolist())),
         source_count=_count(shown[0], source.points),
         target_count=_count(shown[1], target.points),
-        details=_details(result, source, target, source_name, target_name),
+        evidence=_rows(_evidence(result)),
+        details=_rows(_details(result, source, target, source_name, target_name)),
         scene=_json(_scene(*shown, result)),
     )
     write_text(path, page)
@@ -91,15 +107,12 @@ def write_report(
 
 def _headlines(result: RegistrationResult) -> str:
     """Lay out the four figures at the top as cards."""
-    rotation = result.transformation[:3, :3]
-    # the arc sine of the chord, unlike the arc cosine of the trace, is accurate for small angles too
-    angle = 2 * math.asin(min(1.0, float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8)))
     shift = float(np.linalg.norm(result.transformation[:3, 3]))
     distance = _number(result.max_correspondence_distance, 3)
     cards = [
         ("Fitness", f"{100 * result.fitness:.1f} %", f"of the source lies within {distance} of the target"),
         ("Inlier RMSE", _number(result.inlier_rmse, 3), "distance of those points, in the input’s unit"),
-        ("Rotation", f"{_number(math.degrees(angle))}°", "angle, about one axis"),
+        ("Rotation", _degrees(result.transformation[:3, :3]), "angle, about one axis"),
         ("Translation", _number(shift), "length, in the input’s unit"),
     ]
     return "\n".join(
@@ -110,11 +123,11 @@ def _headlines(result: RegistrationResult) -> str:
 
 def _details(
     result: RegistrationResult, source: PointCloud, target: PointCloud, source_name: str, target_name: str
-) -> str:
-    """Lay out the other figures as the rows of a table."""
+) -> _Rows:
+    """Name the other figures."""
     kept = int(np.count_nonzero(result.matches.weight))
     moved = result.apply(source.points.mean(axis=0)) - source.points.mean(axis=0)
-    rows: _Rows = [
+    return [
         ("Source", f"{source_name}, {len(source.points):,} points"),
         ("Target", f"{target_name}, {len(target.points):,} points"),
         ("Source’s centroid moves by", _number(float(np.linalg.norm(moved)))),
@@ -124,6 +137,19 @@ def _details(
         ("Model", result.model),
         ("Time", f"{_number(result.seconds, 3)} s"),
     ]
+
+
+def _evidence(result: RegistrationResult) -> _Rows:
+    """Name what the confidence was computed from, and the best of the other answers."""
+    rows = [(_EVIDENCE.get(name, name), _number(value, 2)) for name, value in asdict(result.evidence).items()]
+    for place, other in enumerate(result.hypotheses[:RUNNERS_UP], start=2):
+        turn = _degrees(result.transformation[:3, :3].T @ other.transformation[:3, :3])
+        rows.append((f"Answer {place}, {turn} away from this one", f"agreement {_number(other.score, 2)}"))
+    return rows
+
+
+def _rows(rows: _Rows) -> str:
+    """Lay out labels and values as the rows of a table."""
     return "\n".join(f"<tr><th>{_escape(label)}</th><td>{_escape(value)}</td></tr>" for label, value in rows)
 
 
@@ -136,6 +162,13 @@ def _matrix(transformation: NDArray[np.float64]) -> str:
     return "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows).replace("-", "−")
 
 
+def _degrees(rotation: NDArray[np.float64]) -> str:
+    """Write the angle of a rotation (3, 3)."""
+    # the arc sine of the chord, unlike the arc cosine of the trace, is accurate for small angles too
+    angle = 2 * math.asin(min(1.0, float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8)))
+    return f"{_number(math.degrees(angle))}°"
+
+
 def _count(shown: NDArray[np.float64], points: NDArray[np.float64]) -> str:
     """How many points there are, and how many of them are shown if not all."""
     if len(shown) == len(points):
@@ -146,13 +179,6 @@ def _count(shown: NDArray[np.float64], points: NDArray[np.float64]) -> str:
 def _verdict(confidence: float) -> tuple[str, str]:
     """Say what a confidence means: the style of its bar, and a sentence."""
     return next((level, verdict) for least, level, verdict in _VERDICTS if confidence >= least or least == 0)
-
-
-def _chance(confidence: float) -> str:
-    """Write a probability in whole per cent, never rounded to certainty."""
-    if confidence > 0.99:
-        return "> 99 %"
-    return "< 1 %" if confidence < 0.01 else f"{100 * confidence:.0f} %"
 
 
 def _number(value: float, digits: int = 4) -> str:
@@ -178,24 +204,19 @@ def _scene(source: NDArray[np.float64], target: NDArray[np.float64], result: Reg
     local = [points - centre for points, centre in zip((source, target), centres, strict=True)]
     rotation = result.transformation[:3, :3]
     moved = result.apply(centres[0]) - centres[1]
-    offset, gap = _approach(local, centres[0] - centres[1])
+    offset, gap = approach(local, centres[0] - centres[1])
     return {
         "source": clouds[0],
         "target": clouds[1],
         "matches": _matches(result.matches, centres),
-        "before": {"pose": _pose(np.eye(3), offset), "gap": gap, **_view(local[0] + offset, local[1])},
-        "after": {"pose": _pose(rotation, moved), "gap": "", **_view(local[0] @ rotation.T + moved, local[1])},
-        "up": _up(target),
+        "before": {
+            "pose": _pose(np.eye(3), offset),
+            "gap": _number(gap) if gap else "",
+            **frame(local[0] + offset, local[1]),
+        },
+        "after": {"pose": _pose(rotation, moved), "gap": "", **frame(local[0] @ rotation.T + moved, local[1])},
+        "up": guess_up(target),
     }
-
-
-def _sample(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """At most :data:`MAX_POINTS` finite ones of the points, always the same, in their order."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) <= MAX_POINTS:
-        return points
-    # at random: every n-th point of an ordered scan would leave stripes
-    return points[np.sort(np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False))]
 
 
 def _cloud(points: NDArray[np.float64]) -> dict[str, Any]:
@@ -216,38 +237,6 @@ def _matches(matches: Matches, centres: list[NDArray[np.float64]]) -> dict[str, 
         "weights": _base64(matches.weight[order], "<f4"),
         "strongest": _number(float(matches.weight.max(initial=0)), 2),
     }
-
-
-def _approach(local: list[NDArray[np.float64]], offset: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
-    """Shorten the source's offset before where the clouds lie too far apart to be seen in one picture.
-
-    Returns:
-        The offset to draw, and the distance it stands for as text, empty where it is drawn as it is.
-    """
-    reach = sum(_view(points)["radius"] for points in local)
-    gap = float(np.linalg.norm(offset))
-    if gap <= 3 * reach:
-        return offset, ""
-    return offset * (1.2 * reach / gap), _number(gap)
-
-
-def _view(*clouds: NDArray[np.float64]) -> dict[str, Any]:
-    """Centre and radius of the sphere to look at; a few stray points are left outside."""
-    ranges = np.stack([np.percentile(points, [1, 99], axis=0) for points in clouds])
-    centre = (ranges[:, 0].min(axis=0) + ranges[:, 1].max(axis=0)) / 2
-    radius = max(float(np.percentile(np.linalg.norm(points - centre, axis=1), 99)) for points in clouds)
-    return {"centre": centre.tolist(), "radius": radius or 1.0}
-
-
-def _up(points: NDArray[np.float64]) -> str:
-    """Guess the axis that points up, to begin with: the page lets one choose another."""
-    low, high = np.percentile(points, [1, 99], axis=0)
-    width, depth, height = high - low
-    if height < 0.35 * min(width, depth):
-        return "+z"  # flat: ground seen by a laser scanner
-    if low[2] > 0 and max(np.abs([low[:2], high[:2]]).max(axis=0)) < high[2]:
-        return "-y"  # in front of the origin: a depth camera's frame
-    return "+y"
 
 
 def _pose(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> list[list[float]]:

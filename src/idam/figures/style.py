@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from idam.io.files import write_bytes
 
-__all__ = ["BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "VERMILLION", "look", "save"]
+__all__ = ["BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "VERMILLION", "look", "save", "save_as"]
 
 PAGE = 4.8
 """Width of the paper's text in inches: printed as they are, the figures fit, and 8 point is 8 point."""
@@ -57,11 +57,20 @@ def save(figure: Figure, stem: Path) -> list[Path]:
     Raises:
         InputError: a file cannot be written.
     """
-    written = []
-    for kind, metadata in (("png", {}), ("svg", {"Date": None})):  # without the date, the same bytes every time
-        stream = io.BytesIO()
-        figure.savefig(stream, format=kind, metadata=metadata)
-        path = stem.with_name(f"{stem.name}.{kind}")
-        write_bytes(path, stream.getvalue())
-        written.append(path)
+    written = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
+    for path in written:
+        save_as(figure, path)
     return written
+
+
+def save_as(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG or SVG, by the file's extension, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    stream = io.BytesIO()
+    # without the date, the same bytes every time
+    figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else {})
+    write_bytes(path, stream.getvalue())

@@ -90,11 +90,12 @@ def finite_cloud(points: Numbers, colors: Numbers | None, normals: Numbers | Non
     """
     if not len(points):
         raise InputError("holds no points: export it again")
+    points = points.astype(np.float64, copy=False)  # before the check: what an extended float holds, a double may not
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         raise InputError(f"every one of its {len(points):,} points is NaN or infinite: export it again")
     return PointCloud(
-        points[finite].astype(np.float64),
+        points[finite],
         None if colors is None else _to_uint8(colors)[finite],
         None if normals is None else normals[finite].astype(np.float64),
     )

@@ -1,0 +1,70 @@
+"""The documentation's Python blocks run, and its command lines name commands and options that exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from idam import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ["README.md", "docs/guide.md", "docs/examples.md"]
+
+
+@pytest.fixture
+def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with the shipped scans in it under the names that the pages use."""
+    with resources.as_file(resources.files("idam") / "data" / "demo") as demo:
+        for name, role in (("scan1.ply", "source.ply"), ("scan2.ply", "target.ply")):
+            shutil.copy(demo / role, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def blocks(page: str, *languages: str) -> list[tuple[int, str]]:
+    """The fenced blocks of a page in these languages: the number of their first line, and their text."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    fenced = re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [(text.count("\n", 0, each.start(2)) + 1, each[2]) for each in fenced if each[1] in languages]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_python_blocks_run_one_after_the_other(scans: Path, page: str) -> None:
+    if "figures" in (ROOT / page).read_text(encoding="utf-8"):
+        pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    found = blocks(page, "python")
+    assert found
+    for line, block in found:
+        # the line breaks before it make the line numbers of a traceback the page's own
+        exec(compile("\n" * (line - 1) + block, str(ROOT / page), "exec"), namespace)
+
+
+def command_lines() -> list[list[str]]:
+    lines = [line for page in PAGES for _, block in blocks(page, "", "sh") for line in block.splitlines()]
+    commands = [re.search(r"\bidam [a-z].*", line.partition("#")[0]) for line in lines]
+    return [re.split(r"[>;|&]", found[0])[0].split() for found in commands if found]
+
+
+def test_command_lines_name_what_there_is() -> None:
+    root: Any = typer.main.get_command(cli.app)
+    assert command_lines()
+    for program, name, *words in command_lines():
+        assert program == "idam"
+        command = root.commands[name]
+        known = {option for parameter in command.params for option in parameter.opts}
+        assert {word for word in words if word.startswith("-")} <= known, shlex.join([program, name, *words])
+
+
+@pytest.mark.parametrize("page", [*PAGES, "docs/architecture.md"])
+def test_links_lead_somewhere(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert ((ROOT / page).parent / target).exists(), target
