@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from idam.evaluation.methods import METHODS
 from idam.evaluation.runner import Row
 from idam.evaluation.table import columns
 
@@ -17,6 +18,7 @@ TITLES = {
     "unseen-shapes": "Unseen shapes (section 4.1)",
     "unseen-categories": "Unseen categories (section 4.2)",
     "gaussian-noise": "Gaussian noise (section 4.3)",
+    "ablation": "Ablation (section 4.6), on unseen categories",
     "practice": "Closer to practice: disjoint points, crops of their own, turned to 45 degrees",
     "practice-any-rotation": "Closer to practice, turned in any way",
 }
@@ -33,24 +35,46 @@ only, as their number says.
 """
 
 
-def section(record: dict[str, Any]) -> str:
-    """One experiment's table, and where it comes from."""
-    experiment, machine = record["pairs_from"], record["machine"]
+def table(records: list[dict[str, Any]]) -> str:
+    """One experiment's table, of all files that hold rows of it, and where they come from."""
+    experiment = records[0]["pairs_from"]
+    if len({record["checksum"] for record in records}) > 1:
+        raise SystemExit(f"{experiment}: the files are of different pairs")
     cells = columns(experiment)
-    lines = [f"## {TITLES.get(experiment, experiment)}", "", line(list(cells)), line(["---"] * len(cells))]
-    for row in record["rows"]:
+    lines = [f"## {TITLES[experiment]}", "", line(list(cells)), line(["---"] * len(cells))]
+    rows = [row for record in records for row in record["rows"]]
+    for row in sorted(rows, key=lambda row: list(METHODS).index(row["method"])):
         if "missing" in row:
             lines.append(line([row["method"], row["missing"].split(":")[0], *[""] * (len(cells) - 2)]))
         else:
             lines.append(line([cell(Row.from_dict(row)) for cell in cells.values()]))
-    lines += [
-        "",
-        f"`{record['command']}`, {record['date'][:10]}, seed {record['seed']}, pairs {record['checksum']}, on "
+    return "\n".join([*lines, "", *map(origin, records)])
+
+
+def origin(record: dict[str, Any]) -> str:
+    """The command, date, seed and machine of a file of rows."""
+    machine = record["machine"]
+    return (
+        f"- `{record['command']}`: {record['date'][:10]}, seed {record['seed']}, pairs {record['checksum']}, "
         f"{machine['cores']} cores of an {machine['processor']}, PyTorch {machine['torch']}, "
-        f"{machine['jobs']} {'process' if machine['jobs'] == 1 else 'processes'}.",
-        "",
+        f"{machine['jobs']} {'process' if machine['jobs'] == 1 else 'processes'}."
+    )
+
+
+def efficiency(record: dict[str, Any]) -> str:
+    """Milliseconds of each method at each number of points."""
+    times: dict[str, dict[str, float]] = record["median_ms"]
+    lines = ["## Efficiency (section 4.5)", "", line(["ms, median", *times]), line(["---"] * (len(times) + 1))]
+    lines += [
+        line([name, *(f"{column[name]:.0f}" for column in times.values())]) for name in next(iter(times.values()))
     ]
-    return "\n".join(lines)
+    return "\n".join([*lines, "", f"- `{record['command']}`: {record['date'][:10]}, {record['processor']}."])
+
+
+def real_scans(record: dict[str, Any]) -> str:
+    """Success over pairs of real scans."""
+    about = f"- `benchmarks/scans.py`: {record['date'][:10]}, {record['processor']}. {record['sure']}"
+    return "\n".join(["## Real scans", "", record["table"], "", about])
 
 
 def line(cells: list[str]) -> str:
@@ -63,10 +87,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("records", type=Path, nargs="+")
     records = [json.loads(path.read_text()) for path in parser.parse_args().records]
-    order = list(TITLES)
-    records.sort(key=lambda record: order.index(record["pairs_from"]) if record["pairs_from"] in order else len(order))
+    tables = [[r for r in records if r.get("pairs_from") == experiment] for experiment in TITLES]
+    sections = [table(group) for group in tables if group]
+    sections += [efficiency(record) for record in records if "median_ms" in record]
+    sections += [real_scans(record) for record in records if "sure" in record]
     print(INTRODUCTION)
-    print("\n".join(section(record) for record in records), end="")
+    print("\n\n".join(sections))
 
 
 if __name__ == "__main__":

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import statistics
+import sys
 import time
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +24,8 @@ from numpy.typing import NDArray
 
 from idam.data.pairs import MAX_ANGLE
 from idam.errors import MissingDependencyError
-from idam.evaluation.methods import METHODS, Method, build_method
+from idam.evaluation.methods import Method, build_method, rows_of
+from idam.evaluation.record import processor
 from idam.geometry import euler_xyz_to_rotation
 
 Points = NDArray[np.float32]
@@ -76,7 +80,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, nargs="+", default=[1024, 2048, 4096])
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--methods", nargs="+", default=[name for name in METHODS if name not in ENDLESS])
+    parser.add_argument(
+        "--methods", nargs="+", default=[name for name in rows_of("unseen-shapes") if name not in ENDLESS]
+    )
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     methods = build_methods(arguments.methods)
@@ -86,7 +92,13 @@ def main() -> None:
     for name in methods:
         print(f"{name:<{width}}" + "".join(f"{results[points][name]:>10.1f}" for points in results))
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"threads": torch.get_num_threads(), "median_ms": results}, indent=1))
+        about = {
+            "command": shlex.join(["python", *sys.argv]),
+            "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "processor": processor(),
+            "threads": torch.get_num_threads(),
+        }
+        arguments.json.write_text(json.dumps({**about, "median_ms": results}, indent=1))
 
 
 if __name__ == "__main__":
