@@ -7,7 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from idam.errors import InputError
-from idam.preprocess import MIN_POINTS, Frame, check_points, choose_voxel_size, common_frame, downsample
+from idam.preprocess import (
+    MIN_POINTS,
+    STRAY,
+    Frame,
+    check_points,
+    choose_voxel_size,
+    common_frame,
+    downsample,
+    voxels,
+    without_strays,
+)
 
 ORIGIN = np.zeros(3)
 UTM = np.array([5e5, 5.6e6, 100.0])
@@ -115,6 +125,44 @@ def test_a_stray_point_shrinks_nothing_else(source: np.ndarray, target: np.ndarr
     np.testing.assert_allclose(strayed.source(source), frame.source(source), atol=0.1)
 
 
+def test_order_of_the_points_changes_no_more_than_rounding(
+    random: np.random.Generator, source: np.ndarray, target: np.ndarray
+) -> None:
+    frame = common_frame(source, target)
+    shuffled = common_frame(random.permutation(source), target[::-1])
+    np.testing.assert_allclose(shuffled.source_centre, frame.source_centre, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(shuffled.target_centre, frame.target_centre, rtol=0, atol=1e-14)
+    assert shuffled.scale == pytest.approx(frame.scale, rel=1e-14)
+
+
+@pytest.mark.parametrize("layout", [np.asfortranarray, lambda points: np.repeat(points, 2, axis=0)[::2]])
+def test_layout_in_memory_does_not_matter(source: np.ndarray, target: np.ndarray, layout) -> None:
+    frame, other = common_frame(source, target), common_frame(layout(source), layout(target))
+    np.testing.assert_array_equal(other.source_centre, frame.source_centre)
+    assert other.scale == frame.scale
+
+
+@PLACES
+def test_both_clouds_are_treated_alike(source: np.ndarray, target: np.ndarray, place: np.ndarray) -> None:
+    def prepare(one: np.ndarray, other: np.ndarray) -> list[np.ndarray]:
+        frame = common_frame(one, other)
+        clouds = [without_strays(frame.source(one)), without_strays(frame.target(other))]
+        size = choose_voxel_size(clouds, 200)
+        return [downsample(cloud, size) for cloud in clouds]
+
+    there, back = prepare(source + place, target), prepare(target, source + place)
+    for one, other in zip(there, reversed(back), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_strays_are_what_the_voxel_grid_has_no_room_for(random: np.random.Generator) -> None:
+    directions = random.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    distance = np.concatenate([random.uniform(0, 0.99 * STRAY, 200), STRAY * 10 ** random.uniform(0.01, 90, 100)])
+    points = directions * distance[:, None]
+    np.testing.assert_array_equal(without_strays(points), points[:200])
+
+
 # --- what cannot be registered --------------------------------------------------------------------------------------
 
 
@@ -178,6 +226,60 @@ def test_chosen_voxel_size_leaves_about_the_count_of_the_larger(dense: np.ndarra
     assert size == choose_voxel_size([dense, dense[:3000] / 2], count)
 
 
+@pytest.fixture(params=["surface", "curve", "volume", "hardly more than asked for"])
+def crowd(request: pytest.FixtureRequest, random: np.random.Generator, dense: np.ndarray) -> np.ndarray:
+    """Clouds whose voxels grow in number with different powers of their size."""
+    return {
+        "surface": dense,
+        "curve": random.uniform(-1, 1, (6000, 1)) * [1.0, 0.01, 0.01],
+        "volume": random.uniform(-1, 1, (6000, 3)),
+        "hardly more than asked for": dense[:510],
+    }[request.param]
+
+
+def test_any_shape_of_cloud_leaves_nearly_the_count(crowd: np.ndarray) -> None:
+    left = len(downsample(crowd, choose_voxel_size([crowd], 500)))
+    assert 480 <= left <= 500
+
+
+@pytest.mark.parametrize("count", [100, 1000])
+def test_voxel_size_follows_from_neither_order(random: np.random.Generator, dense: np.ndarray, count: int) -> None:
+    other = dense[::2] * [1.0, 0.5, 0.5]
+    size = choose_voxel_size([dense, other], count)
+    assert size == choose_voxel_size([other, dense], count)
+    assert size == choose_voxel_size([random.permutation(dense), other[::-1]], count)
+
+
+@pytest.mark.parametrize("copies", [2, 20])
+def test_copies_are_no_further_points(dense: np.ndarray, copies: int) -> None:
+    few = dense[:400]
+    size = choose_voxel_size([np.repeat(few, copies, axis=0)], 500)
+    assert len(downsample(few, size)) > 390
+
+
+def test_points_on_a_lattice_leave_no_more_than_the_count() -> None:
+    steps = np.linspace(-1, 1, 12)
+    lattice = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
+    # whole layers of voxels fill at once, and around the centre two at a time: the next number is 8 ** 3
+    assert len(downsample(lattice, choose_voxel_size([lattice], 500))) == 6**3
+
+
+@pytest.mark.parametrize("size", [0.01, 0.13, 3.0])
+def test_voxels_are_those_of_downsample(dense: np.ndarray, size: float) -> None:
+    numbers = voxels(dense, size)
+    assert numbers.shape == (len(dense),)
+    assert len(np.unique(numbers)) == len(downsample(dense, size))
+    _, index = np.unique(np.floor(dense / size), axis=0, return_inverse=True)
+    same = index == index[0]
+    np.testing.assert_array_equal(numbers == numbers[0], same)
+
+
+def test_voxels_have_numbers_however_far_the_points() -> None:
+    ends = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]])
+    far = voxels(np.vstack([ends, 1e9 * ends, 1e100 * ends]), 0.1)
+    assert len(set(far)) == 4  # the far ones share the corners of the grid
+
+
 def test_small_clouds_stay_whole(dense: np.ndarray) -> None:
     assert choose_voxel_size([dense[:500], dense[:300]], 500) == 0.0
     assert choose_voxel_size([dense[:501], dense[:300]], 500) > 0.0
@@ -191,3 +293,10 @@ def test_downsample_is_the_mean_of_each_voxel(dense: np.ndarray) -> None:
     found = downsample(dense, 0.25)
     np.testing.assert_allclose(found[np.lexsort(found.T)], means[np.lexsort(means.T)], atol=1e-12)
     np.testing.assert_array_equal(found, downsample(dense, 0.25))
+
+
+def test_order_of_the_points_changes_last_bits_of_the_means_alone(
+    random: np.random.Generator, dense: np.ndarray
+) -> None:
+    found, shuffled = downsample(dense, 0.25), downsample(random.permutation(dense), 0.25)
+    np.testing.assert_allclose(shuffled, found, rtol=0, atol=1e-14)

@@ -53,6 +53,13 @@ def test_refinable_keeps_points_and_has_unit_normals(pair: Pair) -> None:
     np.testing.assert_allclose(np.linalg.norm(pair[0].normals, axis=1), 1.0, atol=1e-6)
 
 
+def test_refinable_makes_its_search_tree_once(pair: Pair) -> None:
+    distance, index = pair[0].search.query(pair[0].points)
+    np.testing.assert_array_equal(index, np.arange(len(pair[0].points)))
+    assert not distance.any()
+    assert pair[0].search is pair[0].search
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_recovers_a_small_perturbation(pair: Pair, method: str) -> None:
     source, target, truth = pair

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import astuple
+from collections.abc import Callable, Iterator
+from dataclasses import astuple, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,16 @@ from scipy.spatial.transform import Rotation
 
 import idam
 from idam import RegistrationResult, registration
+from idam import search as searching
+from idam.confidence import CONVERGED, Evidence, confidence, doubt
 from idam.errors import InputError
-from idam.hypotheses import Hypothesis
 from idam.io import PointCloud, write_point_cloud
 from idam.network.pretrained import find
-from idam.ranking import Answer
+from idam.preprocess import common_frame
+from idam.pyramid import Level
+from idam.ranking import alike
 from idam.refine import METHODS
-from idam.registration import Level, finish
+from idam.registration import as_rigid, finish, in_input_units, smaller_first
 from idam.result import Matches
 
 UTM = np.array([5e5, 5.6e6, 100.0])
@@ -58,6 +61,15 @@ def bracket(count: int, seed: int) -> np.ndarray:
     ]
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in corners])
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+
+
+def ball(count: int, seed: int) -> np.ndarray:
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def noise(count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 3))
 
 
 TRUTH = rigid(Rotation.from_rotvec([1.0, -1.5, 0.8]), [1.0, 2.0, 3.0])
@@ -122,7 +134,7 @@ def test_figures_are_those_of_brute_force(result: RegistrationResult) -> None:
 
 
 def test_other_fields(result: RegistrationResult) -> None:
-    assert 0.0 <= result.confidence <= 1.0
+    assert result.confidence == confidence(result.evidence)
     assert all(0.0 <= evidence <= 1.0 for evidence in astuple(result.evidence))
     assert result.model == "default"
     assert 0.0 < result.seconds < 60.0
@@ -134,10 +146,44 @@ def test_matches_are_in_the_input_coordinates(result: RegistrationResult) -> Non
     matches = result.matches
     assert matches.source.shape == matches.target.shape == (*matches.weight.shape, 3)
     assert matches.weight.sum() == pytest.approx(1.0)
-    # 400 points go to the network as they are
+    # 400 points are matched as they are
     assert cdist(matches.source, SOURCE).min(1).max() < 1e-5
-    together = np.linalg.norm(result.apply(matches.source) - matches.target, axis=1) < 0.2
-    assert matches.weight[together].sum() > 0.3
+    assert cdist(matches.target, TARGET).min(1).max() < 1e-5
+
+
+def test_matches_weigh_the_more_the_closer_the_answer_brings_them(result: RegistrationResult) -> None:
+    matches = result.matches
+    miss = np.linalg.norm(result.apply(matches.source) - matches.target, axis=1)
+    kept = matches.weight > 0
+    assert 0 < kept.sum() < len(kept)
+    # the last refinement still moves them a little
+    assert miss[kept].max() < miss[~kept].min() + 0.02
+    assert np.corrcoef(miss[kept], matches.weight[kept])[0, 1] < -0.9
+
+
+def test_runners_up_are_other_transforms_that_score_less(result: RegistrationResult) -> None:
+    assert result.hypotheses
+    scores = [other.score for other in result.hypotheses]
+    assert scores == sorted(scores, reverse=True)
+    assert result.evidence.margin > 0
+    for other in result.hypotheses:
+        rotation = other.transformation[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert not alike(other.transformation, result.transformation)
+        # they, too, bring the source to the target
+        assert np.linalg.norm(move(other.transformation, CENTRE) - TARGET.mean(0)) < 1.5
+
+
+@pytest.mark.parametrize("evidence", [Evidence(0.9, 0.8, 0.9), Evidence(0.1, 0.01, 0.01), Evidence(0.0, 0.0, 0.0)])
+def test_reason_is_given_where_the_answer_is_not_to_count_on(
+    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = registration.search
+    monkeypatch.setattr(registration, "search", lambda *args: replace(search(*args), evidence=evidence))
+    result = idam.register(SOURCE, move(TRUTH, SOURCE))
+    assert result.confidence == confidence(evidence)
+    assert result.converged is (result.confidence >= CONVERGED)
+    assert result.reason == ("" if result.converged else doubt(evidence))
 
 
 def test_max_correspondence_distance_is_what_is_measured_at() -> None:
@@ -159,11 +205,34 @@ def test_same_seed_same_bits(result: RegistrationResult) -> None:
     assert (torch.get_rng_state() == state).all()
 
 
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    """Sets the number of threads, for the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("target", [move(TRUTH, SOURCE[40:]), noise(120, seed=1)], ids=["easy", "hard"])
+def test_any_number_of_threads_same_bits(
+    target: np.ndarray, threads: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searching, "STARTS", 4)
+    found = []
+    for count in (1, 2):
+        threads(count)
+        found.append(idam.register(SOURCE[:150] if len(target) < 150 else SOURCE, target))
+    one, two = found
+    np.testing.assert_array_equal(one.transformation, two.transformation)
+    np.testing.assert_array_equal(one.matches.weight, two.matches.weight)
+    assert one.confidence == two.confidence
+    assert [other.score for other in one.hypotheses] == [other.score for other in two.hypotheses]
+
+
 @pytest.mark.parametrize("seed", [7, -1, np.int64(7)])
 def test_any_seed_finds_the_easy_pair(result: RegistrationResult, seed: Any) -> None:
     other = idam.register(SOURCE, TARGET, seed=seed)
     assert_settled(other.transformation, result.transformation, CENTRE)
-    assert other.evidence != result.evidence  # other starts, other votes
 
 
 def test_clouds_are_left_as_they_were() -> None:
@@ -246,10 +315,79 @@ def test_order_of_points_does_not_matter(result: RegistrationResult) -> None:
     np.testing.assert_array_equal(np.sort(rows[found.correspondence_set[:, 0]]), result.correspondence_set[:, 0])
 
 
+@pytest.mark.parametrize("unlike", [SOURCE, TARGET, move(TRUTH, bracket(300, seed=4)[:200])])
+def test_which_cloud_counts_as_the_smaller_depends_on_the_clouds_alone(unlike: np.ndarray) -> None:
+    other = 1.1 * bracket(450, seed=3)
+    turn = rigid(Rotation.from_rotvec([0.3, 2.0, -1.0]), [1.0, 0.0, -2.0])
+    assert smaller_first(unlike, other) is not smaller_first(other, unlike)
+    assert smaller_first(move(turn, unlike), other) is smaller_first(unlike, other)
+
+
 def test_swapping_the_clouds_inverts_the_answer(result: RegistrationResult) -> None:
-    back = np.linalg.inv(idam.register(TARGET, SOURCE).transformation)
-    assert degrees(back, result.transformation) < 2.0
-    assert np.linalg.norm(move(back, CENTRE) - result.apply(CENTRE)) < 0.02
+    back = idam.register(TARGET, SOURCE)
+    inverse = np.linalg.inv(back.transformation)
+    # found in the same direction, but the last refinement takes the other
+    assert degrees(inverse, result.transformation) < 2.0
+    assert np.linalg.norm(move(inverse, CENTRE) - result.apply(CENTRE)) < 0.02
+    assert back.confidence == result.confidence
+    assert back.evidence == result.evidence
+    assert back.reason == result.reason
+    np.testing.assert_array_equal(back.matches.source, result.matches.target)
+    np.testing.assert_array_equal(back.matches.target, result.matches.source)
+    np.testing.assert_array_equal(back.matches.weight, result.matches.weight)
+    for one, other in zip(back.hypotheses, result.hypotheses, strict=True):
+        np.testing.assert_allclose(np.linalg.inv(one.transformation), other.transformation, atol=1e-9)
+        assert one.score == other.score
+
+
+def test_swapping_the_clouds_and_the_init_inverts_what_is_not_refined() -> None:
+    init = rigid(Rotation.from_rotvec([0.5, 0.0, 0.0]), [1.0, 2.0, 3.0])
+    forth = idam.register(SOURCE, TARGET, refine=None, init=init)
+    back = idam.register(TARGET, SOURCE, refine=None, init=np.linalg.inv(init))
+    np.testing.assert_allclose(np.linalg.inv(back.transformation), forth.transformation, atol=1e-9)
+    assert back.confidence == pytest.approx(forth.confidence, abs=1e-9)
+
+
+def test_a_cloud_on_itself_is_its_own_inverse() -> None:
+    moved = move(TRUTH, SOURCE)
+    forth, back = idam.register(SOURCE, moved), idam.register(moved, SOURCE)
+    for found, truth in ((forth, TRUTH), (back, np.linalg.inv(TRUTH))):
+        np.testing.assert_allclose(found.transformation, truth, atol=1e-4)
+    assert forth.confidence == pytest.approx(back.confidence, abs=1e-6)
+
+
+# --- how sure it is ------------------------------------------------------------------------------------------------
+
+
+def test_sure_of_a_clean_pair_with_much_overlap() -> None:
+    source = bracket(600, seed=1)
+    blurred = source[60:] + np.random.default_rng(0).normal(0, 0.002, (540, 3))
+    found = idam.register(source, move(TRUTH, blurred))
+    assert_right(found, TRUTH, CENTRE)
+    assert found.confidence > 0.9
+    assert found.converged
+    assert found.reason == ""
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        (ball(500, 1), ball(500, 2)),
+        (
+            bracket(400, seed=1),
+            np.asarray(trimesh.sample.sample_surface(trimesh.creation.torus(1, 0.4), 500, seed=3)[0]),
+        ),
+        (bracket(400, seed=1), noise(500, 1)),
+        (bracket(400, seed=1), 0.5 * ball(500, 2)),
+        (bracket(400, seed=1), ball(500, 1)),
+    ],
+    ids=["two spheres", "a torus", "noise", "a small sphere", "a sphere"],
+)
+def test_not_sure_of_what_turns_freely_or_has_nothing_in_common(source: np.ndarray, target: np.ndarray) -> None:
+    found = idam.register(source, target)
+    assert found.confidence < CONVERGED
+    assert not found.converged
+    assert found.reason
 
 
 # --- awkward clouds ------------------------------------------------------------------------------------------------
@@ -309,12 +447,11 @@ def test_refinements(refine: str) -> None:
 def test_last_refinement_takes_the_fine_clouds(method: str) -> None:
     fine = Level(SOURCE - CENTRE, bracket(2000, seed=2) - CENTRE, spacing=0.05)
     start = rigid(Rotation.from_rotvec([0.04, -0.03, 0.02]), [0.01, 0.0, -0.02])
-    answer = Answer(start, Hypothesis(start, Matches(*np.empty((3, 0)))))
-    found, information = finish(answer, fine, method)
+    found, information = finish(start, fine, method)
     assert degrees(found, np.eye(4)) < 1.5 < degrees(start, np.eye(4))
     assert np.linalg.norm(found[:3, 3]) < 0.01
     assert np.linalg.eigvalsh(information).min() > 0
-    untouched, nothing = finish(answer, fine, "none")
+    untouched, nothing = finish(start, fine, "none")
     np.testing.assert_array_equal(untouched, start)
     assert not nothing.any()
 
@@ -354,6 +491,12 @@ def test_init_is_taken_as_the_rotation_nearest_to_it() -> None:
     np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.parametrize("rotation", [[0.0, 0.0, 0.0], [1.0, -1.5, 0.8]])
+def test_as_rigid_keeps_what_is_rigid(rotation: list[float]) -> None:
+    matrix = rigid(Rotation.from_rotvec(rotation), [1, 2, 3])
+    np.testing.assert_allclose(as_rigid(matrix.tolist()), matrix, atol=1e-12)
+
+
 def test_init_may_be_far_off(result: RegistrationResult) -> None:
     far = rigid(Rotation.from_rotvec([3.0, 0.0, 0.0]), [50.0, 0.0, -9.0])
     for init in (far, far.tolist(), torch.tensor(far)):
@@ -367,10 +510,10 @@ def test_init_of_clouds_far_from_the_origin() -> None:
     np.testing.assert_allclose(found.apply(SOURCE + UTM), move(TRUTH, SOURCE) + UTM, rtol=0, atol=1e-6)
 
 
-def test_voxel_size_sets_what_the_network_sees() -> None:
+def test_voxel_size_sets_where_matches_are_sought() -> None:
     source, target = bracket(2000, seed=1), move(TRUTH, bracket(2000, seed=2))
     coarse, fine = (idam.register(1000 * source, 1000 * target, voxel_size=size) for size in (150.0, 60.0))
-    assert 20 / 6 <= len(coarse.matches.weight) < len(fine.matches.weight) < 2000 / 6
+    assert len(coarse.matches.weight) < len(fine.matches.weight) < 2000
     assert_right(fine, rigid(Rotation.from_matrix(TRUTH[:3, :3]), 1000 * TRUTH[:3, 3]), 1000 * CENTRE, 1000.0)
 
 
@@ -436,7 +579,7 @@ def test_refuses_a_voxel_size_that_leaves_nothing() -> None:
 
 
 def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "propose", lambda *_: pytest.fail("the network was given all of them"))
+    monkeypatch.setattr(registration, "search", lambda *_: pytest.fail("all of them were searched"))
     assert "larger" in refusal(bracket(6000, seed=1), bracket(6000, seed=2), voxel_size=1e-4)
 
 
@@ -482,6 +625,19 @@ def test_refuses_a_file_that_is_no_model(tmp_path: Path) -> None:
 )
 def test_refuses_what_is_not_rigid(init: Any) -> None:
     assert refusal(init=init).startswith("init ")
+
+
+# --- coordinates ---------------------------------------------------------------------------------------------------
+
+
+def test_matches_in_input_units_keep_their_weights() -> None:
+    frame = common_frame(SOURCE + UTM, 2 * TARGET)
+    weight = np.linspace(0, 1, len(SOURCE))
+    working = Matches(frame.source(SOURCE + UTM), frame.target(2 * TARGET[: len(SOURCE)]), weight)
+    matches = in_input_units(working, frame)
+    np.testing.assert_allclose(matches.source, SOURCE + UTM, atol=1e-6)
+    np.testing.assert_allclose(matches.target, 2 * TARGET[: len(SOURCE)], atol=1e-9)
+    assert matches.weight is weight
 
 
 # --- the shipped scans ---------------------------------------------------------------------------------------------

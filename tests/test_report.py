@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ import pytest
 from idam.confidence import Evidence
 from idam.errors import InputError
 from idam.io import PointCloud
-from idam.report import MAX_POINTS, write_report
-from idam.result import Matches, RegistrationResult
+from idam.report import MAX_POINTS, RUNNERS_UP, write_report
+from idam.result import Hypothesis, Matches, RegistrationResult
 
 HERE = (0.0, 0.0, 0.0)
 NATIONAL_GRID = (512_300.0, 5_403_200.0, 320.0)
@@ -38,6 +39,8 @@ def make_pair(
     match_count: int = 24,
     confidence: float = 0.873,
     model: str = "gnn-unseen-shapes",
+    reason: str = "",
+    hypotheses: Sequence[Hypothesis] = (),
 ) -> tuple[PointCloud, PointCloud, RegistrationResult]:
     rng = np.random.default_rng(0)
     rotation = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1.0]])
@@ -50,10 +53,21 @@ def make_pair(
     weight = np.where(rng.random(match_count) < 0.3, 0.0, rng.random(match_count))
     matches = Matches(source[rows], target[rows], weight / max(weight.sum(), 1))
     pairs = np.stack([np.arange(count), np.arange(count)], axis=1)
-    information = np.zeros((6, 6))
-    evidence = Evidence(overlap=0.5, margin=0.2, support=0.9, votes=0.4)
     result = RegistrationResult(
-        transformation, 0.75, 0.0123, pairs, confidence, evidence, 0.05, information, matches, model, 0.042
+        transformation=transformation,
+        fitness=0.75,
+        inlier_rmse=0.0123,
+        correspondence_set=pairs,
+        confidence=confidence,
+        converged=confidence >= 0.5,
+        reason=reason,
+        hypotheses=list(hypotheses),
+        evidence=Evidence(overlap=0.5, margin=0.2, support=0.9),
+        max_correspondence_distance=0.05,
+        information=np.zeros((6, 6)),
+        matches=matches,
+        model=model,
+        seconds=0.042,
     )
     return PointCloud(source), PointCloud(target), result
 
@@ -222,12 +236,37 @@ def test_figures_are_in_the_page_itself(tmp_path: Path) -> None:
         assert text in page
 
 
+def test_what_the_confidence_is_computed_from_is_in_the_page(tmp_path: Path) -> None:
+    page = write(tmp_path / "page.html")
+    for label, value in (
+        ("Agreement of the clouds", "0.50"),
+        ("next best answer", "0.20"),
+        ("feature matches", "0.90"),
+    ):
+        assert re.search(rf"<th>[^<]*{label}[^<]*</th><td>{value}</td>", page)
+
+
+def test_reason_is_said_where_there_is_one(tmp_path: Path) -> None:
+    assert 'id="reason"></p>' in write(tmp_path / "page.html")
+    page = write(tmp_path / "page.html", *make_pair(confidence=0.2, reason="overlap <10 %"))
+    assert 'id="reason">Overlap &lt;10 %.</p>' in page
+
+
+def test_best_runners_up_are_named(tmp_path: Path) -> None:
+    turned = make_pair()[2].transformation @ np.diag([-1.0, -1, 1, 1])
+    others = [Hypothesis(turned, score=0.4 - 0.01 * n) for n in range(RUNNERS_UP + 2)]
+    page = write(tmp_path / "page.html", *make_pair(hypotheses=others))
+    assert "<th>Answer 2, 180.0° away from this one</th><td>agreement 0.40</td>" in page
+    assert page.count("away from this one") == RUNNERS_UP
+
+
 @pytest.mark.parametrize(
     ("confidence", "shown", "meaning"),
     [
         (1.0, "&gt; 99 %", "very likely aligned"),
         (0.8, "80 %", "probably aligned"),
         (0.5, "50 %", "may be misaligned"),
+        (0.49, "49 %", "probably misaligned"),
         (0.0, "&lt; 1 %", "probably misaligned"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib import metadata, resources
 from pathlib import Path
 
@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 import idam
 from idam import RegistrationResult
-from idam.confidence import Evidence, confidence
+from idam.confidence import Evidence
 from idam.errors import InputError
 from idam.io import read_transform
-from idam.result import Matches
+from idam.result import Hypothesis, Matches
 
 SLOW = {"torch", "scipy", "small_gicp", "trimesh"}
 
@@ -34,7 +34,10 @@ def result() -> RegistrationResult:
         inlier_rmse=0.01,
         correspondence_set=np.array([[0, 2], [1, 1], [5, 0]]),
         confidence=0.9,
-        evidence=Evidence(overlap=0.6, margin=0.2, support=0.8, votes=0.5),
+        converged=True,
+        reason="",
+        evidence=Evidence(overlap=0.6, support=0.8, margin=0.2),
+        hypotheses=[Hypothesis(np.diag([-1.0, -1, 1, 1]), 0.4), Hypothesis(np.diag([1.0, -1, -1, 1]), 0.3)],
         max_correspondence_distance=0.05,
         information=np.diag(np.arange(6.0)),
         matches=Matches(np.zeros((4, 3)), np.ones((4, 3)), np.full(4, 0.25)),
@@ -58,9 +61,20 @@ def test_to_dict_is_ready_for_json(result: RegistrationResult) -> None:
     assert content["transformation"] == result.transformation.tolist()
     assert content["information"] == result.information.tolist()
     assert content["correspondences"] == 3
-    assert content["evidence"] == {"overlap": 0.6, "margin": 0.2, "support": 0.8, "votes": 0.5}
-    alike = ("fitness", "inlier_rmse", "confidence", "max_correspondence_distance", "model", "seconds")
-    assert {name: content[name] for name in alike} == {name: getattr(result, name) for name in alike}
+    assert content["evidence"] == {"overlap": 0.6, "support": 0.8, "margin": 0.2}
+    assert content["hypotheses"] == [
+        {"transformation": np.diag([-1.0, -1, 1, 1]).tolist(), "score": 0.4},
+        {"transformation": np.diag([1.0, -1, -1, 1]).tolist(), "score": 0.3},
+    ]
+    alike = ("fitness", "inlier_rmse", "confidence", "converged", "reason", "max_correspondence_distance", "model")
+    assert {name: content[name] for name in (*alike, "seconds")} == {
+        name: getattr(result, name) for name in (*alike, "seconds")
+    }
+
+
+def test_to_dict_names_every_field_but_the_large_ones(result: RegistrationResult) -> None:
+    names = {field.name for field in fields(result)} - {"correspondence_set", "matches"}
+    assert set(result.to_dict()) == names | {"correspondences"}
 
 
 @pytest.mark.parametrize("name", ["T.json", "T.txt", "T.TXT", "T.JSON"])
@@ -93,17 +107,6 @@ def test_repr_is_short(result: RegistrationResult) -> None:
     many = replace(result, correspondence_set=np.zeros((10_000, 2), np.int64))
     assert len(repr(many)) < 2000
     assert "fitness=0.75" in repr(many)
-
-
-# --- confidence ----------------------------------------------------------------------------------------------------
-
-
-def test_confidence_is_a_probability_that_grows_with_the_evidence() -> None:
-    grid = np.linspace(0, 1, 5)
-    everything = [confidence(Evidence(overlap=x, margin=x, support=x, votes=x)) for x in grid]
-    assert all(0.0 < p < 1.0 for p in everything)
-    assert everything == sorted(everything)
-    assert everything[0] < 0.5 < everything[-1]
 
 
 # --- the package ---------------------------------------------------------------------------------------------------

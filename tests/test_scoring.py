@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from idam.refine import Refinable
-from idam.scoring import Agreement, agreement, inliers
+from idam.scoring import SAME_SURFACE, Agreement, agreement, inliers
 
 DISTANCE = 0.1
 
@@ -21,6 +22,10 @@ class Surface:
 
     points: np.ndarray
     normals: np.ndarray
+
+    @property
+    def search(self) -> cKDTree:
+        return cKDTree(self.points)
 
 
 @pytest.fixture
@@ -75,6 +80,22 @@ def test_swapping_the_clouds_swaps_the_shares(
     assert (there.source_share, there.target_share) == (back.target_share, back.source_share)
     assert there.score == back.score
     assert 0.3 < there.target_share < 0.9
+
+
+def test_shares_are_those_of_brute_force(
+    sphere: Surface, transformation: np.ndarray, random: np.random.Generator
+) -> None:
+    source = part(sphere, slice(0, 350))
+    target = moved(part(sphere, slice(200, 500)), transformation)
+    target = Surface(target.points + random.normal(scale=0.04, size=(300, 3)), target.normals)
+    there = moved(source, transformation)
+    distance = cdist(there.points, target.points)
+    alike = np.abs(there.normals @ target.normals.T) >= SAME_SURFACE
+    on_target, on_source = (
+        (d.min(1) < DISTANCE) & a[np.arange(len(d)), d.argmin(1)] for d, a in ((distance, alike), (distance.T, alike.T))
+    )
+    expected = Agreement(on_target.mean(), on_source.mean())
+    assert agreement(source, target, transformation, DISTANCE) == expected
 
 
 def test_shares_are_those_of_the_points_in_the_overlap(sphere: Surface) -> None:
@@ -138,3 +159,37 @@ def test_no_inliers(random: np.random.Generator) -> None:
     assert pairs.shape == (0, 2)
     assert pairs.dtype == np.int64
     assert rmse == 0.0
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6])
+def test_inliers_in_any_unit_place_and_order(random: np.random.Generator, unit: float) -> None:
+    source, target = random.uniform(size=(300, 3)), random.uniform(size=(200, 3))
+    pairs, rmse = inliers(source, target, DISTANCE)
+    place = unit * np.array([5e5, 5.6e6, 100.0])
+    there, there_rmse = inliers(unit * source + place, unit * target + place, unit * DISTANCE)
+    np.testing.assert_array_equal(there, pairs)
+    assert there_rmse == pytest.approx(unit * rmse, rel=1e-6)
+    rows = random.permutation(len(source))
+    shuffled, _ = inliers(source[rows], target, DISTANCE)
+    np.testing.assert_array_equal(shuffled[np.argsort(rows[shuffled[:, 0]]), 1], pairs[:, 1])
+
+
+@pytest.mark.parametrize("far", [1e9, 1e99])
+def test_a_stray_point_is_no_inlier_and_hides_none(random: np.random.Generator, far: float) -> None:
+    source, target = random.uniform(size=(80, 3)), random.uniform(size=(60, 3))
+    pairs, _ = inliers(source, target, DISTANCE)
+    strayed, _ = inliers(np.vstack([source, [[far, 0, 0]]]), np.vstack([target, [[0, -far, 0]]]), DISTANCE)
+    np.testing.assert_array_equal(strayed, pairs)
+
+
+@pytest.mark.parametrize("distance", [1e-150, 1e-12, 100.0, 1e150])
+def test_inliers_at_any_distance(random: np.random.Generator, distance: float) -> None:
+    points = random.uniform(size=(80, 3))
+    pairs, rmse = inliers(points, points, distance)
+    np.testing.assert_array_equal(pairs, np.stack([np.arange(80)] * 2, 1))
+    assert rmse == 0.0
+
+
+def test_a_distance_too_small_to_square_finds_nothing_and_warns_of_nothing(random: np.random.Generator) -> None:
+    points = random.uniform(size=(80, 3))
+    assert inliers(points, points, 1e-320)[0].shape == (0, 2)

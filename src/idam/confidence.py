@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 
-__all__ = ["Evidence", "confidence"]
+__all__ = ["CONVERGED", "Evidence", "confidence", "doubt", "features"]
+
+CONVERGED = 0.5
+"""Confidence from which an answer is one to count on."""
+CLOSE = 0.1
+"""Margin below which two answers are equally good."""
+SLIGHT = 0.25
+"""Overlap below which it is what is wrong."""
+LITTLE = 1.5
+"""Multiple of the overlap past which a margin says no more."""
 
 
 @dataclass(frozen=True)
@@ -17,22 +26,38 @@ class Evidence:
 
     Attributes:
         overlap: agreement of the clouds under the answer, in [0, 1] (:class:`idam.scoring.Agreement`).
-        margin: by how much that exceeds the agreement under the best other answer, in [0, 1].
-        support: share of the network's weight whose matches the answer brings together.
-        votes: share of the starts that led to the answer.
+        support: share of the feature matches that the answer brings together, in [0, 1].
+        margin: by how much less the best other answer scores (:attr:`idam.ranking.Answer.score`), as a share.
     """
 
     overlap: float
-    margin: float
     support: float
-    votes: float
+    margin: float
+
+
+def features(evidence: Evidence) -> tuple[float, float, float]:
+    """What the logistic function is linear in.
+
+    The first few matches that agree say more than the last; and an answer that explains little is not made sure by
+    others that explain still less.
+    """
+    return evidence.overlap, math.sqrt(evidence.support), min(evidence.margin, LITTLE * evidence.overlap)
 
 
 def confidence(evidence: Evidence) -> float:
     """The probability that the transform is right: a logistic function fitted to held-back synthetic pairs."""
     bias, *weights = _coefficients()
-    logit = bias + sum(w * x for w, x in zip(weights, astuple(evidence), strict=True))
+    logit = bias + sum(w * x for w, x in zip(weights, features(evidence), strict=True))
     return 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, logit))))
+
+
+def doubt(evidence: Evidence) -> str:
+    """Why an answer may be wrong, in words."""
+    if evidence.margin < CLOSE:
+        return "two poses explain the data equally well"
+    if evidence.overlap < SLIGHT:
+        return f"overlap about {100 * evidence.overlap:.0f} %"
+    return "few of the feature matches agree with the answer"
 
 
 @lru_cache(1)

@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from idam.geometry import compose, gather_points, random_rotation
 from idam.network.model import IDAM, KeyPoints
-from idam.result import Matches
 
-__all__ = ["Hypothesis", "nearest_rotation", "propose", "starting_rotations"]
+__all__ = ["as_transform", "nearest_rotation", "propose", "starting_rotations"]
 
 Points = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A candidate transform (4, 4) in working coordinates, and the matches it came from.
-
-    Attributes:
-        transformation: working source to working target.
-        matches: in working coordinates.
-    """
-
-    transformation: Points
-    matches: Matches
 
 
 def starting_rotations(count: int, seed: int) -> torch.Tensor:
@@ -47,8 +31,8 @@ def starting_rotations(count: int, seed: int) -> torch.Tensor:
 
 
 @torch.inference_mode()
-def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor) -> list[Hypothesis]:
-    """One hypothesis for each starting rotation (S, 3, 3) of the source, in that order.
+def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor) -> list[Points]:
+    """A transform (4, 4) from each starting rotation (S, 3, 3) of the source, those the network trusts most first.
 
     Args:
         network: in evaluation mode.
@@ -60,7 +44,18 @@ def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor)
     starts = starts.to(device)
     target_keys = _key_points(network, target, torch.eye(3, device=device).expand_as(starts), same=True)
     source_keys = _key_points(network, source, starts, same=network.features.rotation_invariant)
-    return _run(network, source_keys, target_keys, starts)
+    output = network.match(source_keys, target_keys)
+    rotation, translation = compose(output.rotation, output.translation, starts, torch.zeros_like(output.translation))
+    order = output.trust.sort(descending=True, stable=True).indices.tolist()
+    return [as_transform(rotation[n], translation[n]) for n in order]
+
+
+def as_transform(rotation: torch.Tensor, translation: torch.Tensor) -> Points:
+    """Rotation (3, 3) and translation (3,) in single precision as a rigid (4, 4) in double."""
+    transformation = np.eye(4)
+    transformation[:3, :3] = nearest_rotation(rotation.double().cpu().numpy())
+    transformation[:3, 3] = translation.double().cpu().numpy()
+    return transformation
 
 
 def _key_points(network: IDAM, points: Points, turns: torch.Tensor, *, same: bool) -> KeyPoints:
@@ -73,21 +68,6 @@ def _key_points(network: IDAM, points: Points, turns: torch.Tensor, *, same: boo
         x.expand(len(turns), *x.shape[1:]) for x in (keys.index, keys.features, keys.significance)
     )
     return KeyPoints(gather_points(turned, index), features, index, significance)
-
-
-def _run(network: IDAM, source: KeyPoints, target: KeyPoints, starts: torch.Tensor) -> list[Hypothesis]:
-    output = network.match(source, target)
-    rotation, translation = compose(output.rotation, output.translation, starts, torch.zeros_like(output.translation))
-    last = output.iterations[-1]
-    keys = source.points @ starts
-    hypotheses = []
-    for n in range(len(starts)):
-        transformation = np.eye(4)
-        transformation[:3, :3] = nearest_rotation(rotation[n].double().cpu().numpy())
-        transformation[:3, 3] = translation[n].double().cpu().numpy()
-        matches = Matches(*(x[n].double().cpu().numpy() for x in (keys, last.match, last.weight)))
-        hypotheses.append(Hypothesis(transformation, matches))
-    return hypotheses
 
 
 def nearest_rotation(matrix: Points) -> Points:

@@ -1,17 +1,19 @@
-"""From many hypotheses to one answer: refine each, score each, let the like ones vote for one."""
+"""From many transforms to few answers: refine each, score each, keep one of those that are alike."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.hypotheses import Hypothesis
-from idam.refine import Refinable, refine
+from idam.consensus import FeatureMatches
+from idam.pyramid import Surfaces
+from idam.refine import refine
 from idam.scoring import agreement
 
-__all__ = ["Answer", "Surfaces", "distinct", "improve"]
+__all__ = ["Answer", "distinct", "improve"]
 
 Points = NDArray[np.float64]
 
@@ -23,34 +25,34 @@ TOUCHING = 1.5
 """Spacings within which two surfaces count as touching."""
 
 
-@dataclass(frozen=True)
-class Surfaces:
-    """Both clouds at one resolution, ready for refinement, and the spacing of their points."""
-
-    source: Refinable
-    target: Refinable
-    spacing: float
+CHANCE = 0.01
+"""Share of the feature matches that a wrong answer brings together by chance."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A transform (4, 4) in working coordinates, and what speaks for it.
+    """A transform in working coordinates, and what speaks for it.
 
     Attributes:
-        transformation: working source to working target.
-        hypothesis: where it came from.
+        transformation: (4, 4), working source to working target.
         overlap: agreement of the clouds under it, in [0, 1].
-        votes: how many hypotheses led to it.
+        support: share of the feature matches that it brings together, in [0, 1].
     """
 
     transformation: Points
-    hypothesis: Hypothesis
     overlap: float = 0.0
-    votes: int = 1
+    support: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """What answers are ranked by: surfaces slid into wrong contact overlap, too, but few matches come along."""
+        return float(self.overlap * (self.support + CHANCE) ** 0.25)
 
 
-def improve(answers: list[Answer], surfaces: Surfaces, reach: float, method: str) -> list[Answer]:
-    """Each answer refined within ``reach`` spacings (unless the method is ``none``) and scored; the best first."""
+def improve(
+    answers: list[Answer], surfaces: Surfaces, matches: FeatureMatches, reach: float, method: str
+) -> list[Answer]:
+    """Each answer refined within ``reach`` spacings (unless the method is ``none``) and scored."""
     improved = []
     for answer in answers:
         transformation = answer.transformation
@@ -59,19 +61,15 @@ def improve(answers: list[Answer], surfaces: Surfaces, reach: float, method: str
                 surfaces.source, surfaces.target, transformation, reach * surfaces.spacing, method
             )
         overlap = agreement(surfaces.source, surfaces.target, transformation, TOUCHING * surfaces.spacing).score
-        improved.append(replace(answer, transformation=transformation, overlap=overlap))
-    return sorted(improved, key=lambda answer: -answer.overlap)
+        improved.append(Answer(transformation, overlap, matches.support(transformation)))
+    return improved
 
 
-def distinct(answers: list[Answer]) -> list[Answer]:
-    """The answers, best first, without those that are like a better one, which collects their votes."""
+def distinct(answers: Iterable[Answer]) -> list[Answer]:
+    """The answers without those that are like an earlier one."""
     kept: list[Answer] = []
     for answer in answers:
-        for n, better in enumerate(kept):
-            if alike(answer.transformation, better.transformation):
-                kept[n] = replace(better, votes=better.votes + answer.votes)
-                break
-        else:
+        if not any(alike(answer.transformation, other.transformation) for other in kept):
             kept.append(answer)
     return kept
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from idam.errors import InputError
 
@@ -15,7 +17,8 @@ __all__ = ["METHODS", "Refinable", "refine"]
 Points = NDArray[np.float64]
 
 METHODS = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
-"""Fine alignments by name: generalised ICP, point to plane, point to point."""
+"""Fine alignments by name: generalised ICP, point to plane (as small_gicp has it: each coordinate of the distance times
+the normal's, rather than their inner product), point to point."""
 
 NEIGHBOURS = 15
 """Points that each normal and covariance is estimated from."""
@@ -23,7 +26,12 @@ NEIGHBOURS = 15
 
 @dataclass(frozen=True)
 class Refinable:
-    """A cloud with what fine alignment needs of it: normals, covariances and a search tree."""
+    """A cloud with what fine alignment and scoring need of it, made once: normals, covariances and search trees.
+
+    Attributes:
+        cloud: small_gicp's.
+        tree: small_gicp's.
+    """
 
     cloud: Any
     tree: Any
@@ -38,15 +46,20 @@ class Refinable:
         small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=min(NEIGHBOURS, len(points)))
         return cls(cloud, tree)
 
-    @property
+    @cached_property
     def points(self) -> Points:
         """(N, 3)."""
-        return np.asarray(self.cloud.points()[:, :3])
+        return np.ascontiguousarray(self.cloud.points()[:, :3])
 
-    @property
+    @cached_property
     def normals(self) -> Points:
         """(N, 3), of either sign."""
-        return np.asarray(self.cloud.normals()[:, :3])
+        return np.ascontiguousarray(self.cloud.normals()[:, :3])
+
+    @cached_property
+    def search(self) -> cKDTree:
+        """A tree of the points that answers many queries in one call, which ``tree`` takes one by one from Python."""
+        return cKDTree(self.points)
 
 
 def refine(

@@ -41,9 +41,8 @@ _VERDICTS = (
 
 _EVIDENCE = {
     "overlap": "Agreement of the clouds where they lie on each other, 0 to 1",
-    "margin": "By how much that exceeds the next best answer’s",
-    "support": "Share of the matches’ weight that agrees with the answer",
-    "stiffness": "How firmly the surfaces hold each other, 0 where they slide or turn",
+    "margin": "How much less the next best answer scores, as a share",
+    "support": "Share of the feature matches that the answer brings together",
 }
 """What the fields of :class:`idam.confidence.Evidence` are called on the page."""
 
@@ -62,7 +61,7 @@ def write_report(
     source_name: str,
     target_name: str,
 ) -> None:
-    """Write the page of one registration: the pair before and after, the network's matches, and the figures.
+    """Write the page of one registration: the pair before and after, the feature matches, and the figures.
 
     The page refers to nothing outside itself. It shows at most :data:`MAX_POINTS` of each cloud, and says so. The same
     input gives the same bytes.
@@ -133,7 +132,7 @@ def _details(
         ("Source’s centroid moves by", _number(float(np.linalg.norm(moved)))),
         ("Inlier pairs", f"{len(result.correspondence_set):,}"),
         ("Max correspondence distance", _number(result.max_correspondence_distance)),
-        ("Matches of the network", f"{kept:,} kept, {len(result.matches.weight) - kept:,} eliminated"),
+        ("Feature matches", f"{kept:,} agree, {len(result.matches.weight) - kept:,} do not"),
         ("Model", result.model),
         ("Time", f"{_number(result.seconds, 3)} s"),
     ]

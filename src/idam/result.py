@@ -11,22 +11,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from idam.confidence import Evidence
 
-__all__ = ["Matches", "RegistrationResult"]
+__all__ = ["Hypothesis", "Matches", "RegistrationResult"]
 
 
 @dataclass(frozen=True)
 class Matches:
-    """The network's weighted matches of key points, in the input's coordinates and units.
+    """Matches of points by their features, in the input's coordinates and units.
 
     Attributes:
-        source: key points of the source, (M, 3), where the source was given (not moved).
+        source: points of the source, (M, 3), where the source was given (not moved).
         target: the match of each in the target, (M, 3).
-        weight: their weights in the Procrustes problem of the last iteration, (M,), 0 for eliminated ones, sum 1.
+        weight: how well the answer brings each together, (M,), 0 for those it does not, sum 1 (or 0 for all).
     """
 
     source: NDArray[np.float64]
     target: NDArray[np.float64]
     weight: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Another transform that explains the clouds, though less well.
+
+    Attributes:
+        transformation: (4, 4), source to target coordinates, not refined on all points.
+        score: what it was ranked by (:attr:`idam.ranking.Answer.score`); the answer's is higher.
+    """
+
+    transformation: NDArray[np.float64]
+    score: float
 
 
 @dataclass(frozen=True)
@@ -39,11 +52,14 @@ class RegistrationResult:
         inlier_rmse: root mean square distance of those pairs, in the input's units.
         correspondence_set: (C, 2) rows of source and target of those pairs.
         confidence: probability in [0, 1] that the transform is right.
+        converged: whether that is enough to count on: 0.5 or more.
+        reason: where it is not, why, in words; else empty.
         evidence: what the confidence was computed from.
+        hypotheses: runners-up, the best first: distinct transforms that the search refined and scored as well.
         max_correspondence_distance: the distance the above were measured at, in the input's units.
         information: (6, 6) information matrix of the fine alignment, rotation before translation, in the centred and
             scaled coordinates the alignment ran in; zero if it was off.
-        matches: the network's weighted matches of key points.
+        matches: the feature matches, and how well the answer agrees with each.
         model: name of the network's weights.
         seconds: wall-clock time it took.
     """
@@ -53,7 +69,10 @@ class RegistrationResult:
     inlier_rmse: float
     correspondence_set: NDArray[np.int64]
     confidence: float
+    converged: bool
+    reason: str
     evidence: Evidence = field(repr=False)
+    hypotheses: list[Hypothesis] = field(repr=False)
     max_correspondence_distance: float
     information: NDArray[np.float64] = field(repr=False)
     matches: Matches = field(repr=False)
@@ -87,7 +106,12 @@ class RegistrationResult:
             "correspondences": len(self.correspondence_set),
             "max_correspondence_distance": self.max_correspondence_distance,
             "confidence": self.confidence,
+            "converged": self.converged,
+            "reason": self.reason,
             "evidence": asdict(self.evidence),
+            "hypotheses": [
+                {"transformation": other.transformation.tolist(), "score": other.score} for other in self.hypotheses
+            ],
             "information": self.information.tolist(),
             "model": self.model,
             "seconds": self.seconds,

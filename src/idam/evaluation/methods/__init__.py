@@ -33,6 +33,7 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "fpfh-ransac-tuned": ("classical:ransac", ("ransac_distance=0.02",)),
     "fpfh-ransac-icp-tuned": ("classical:ransac", ("icp_after=0.05",)),
     "kiss-matcher": ("kiss:build", ()),
+    "kiss-matcher-tuned": ("kiss:build", ("voxel_size=0.03",)),
     "pointnetlk": ("pointnetlk:build", ()),
     "dcp": ("dcp:build", ()),
     "prnet": ("prnet:build", ()),

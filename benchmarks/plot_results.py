@@ -1,0 +1,99 @@
+"""Pictures of the tables: the errors of each row in the paper's experiments, and recall on pairs closer to practice.
+
+python benchmarks/plot_results.py docs/images docs/results/*.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from idam.evaluation.methods import METHODS
+from idam.evaluation.paper import PAPER
+from idam.figures.style import BLUE, ORANGE, VERMILLION, look, save
+
+ERRORS = {
+    "unseen-shapes": "unseen shapes",
+    "unseen-categories": "unseen categories",
+    "gaussian-noise": "Gaussian noise",
+}
+RECALLS = {"practice": "turned to 45 degrees", "practice-any-rotation": "turned in any way"}
+
+Rows = dict[str, dict[str, Any]]
+
+
+def read_rows(paths: list[Path]) -> dict[str, Rows]:
+    """The rows of each experiment by method, of all files."""
+    rows: dict[str, Rows] = {}
+    for record in (json.loads(path.read_text()) for path in paths):
+        if "pairs_from" in record:
+            found = {row["method"]: row for row in record["rows"] if "missing" not in row}
+            rows[record["pairs_from"]] = rows.get(record["pairs_from"], {}) | found
+    return rows
+
+
+def panels(rows: dict[str, Rows], titles: dict[str, str]) -> tuple[Figure, list[tuple[str, Any, list[str]]]]:
+    """A figure with a panel for each experiment, and the methods that all panels list, in the tables' order."""
+    known = [name for name in METHODS if any(name in rows[experiment] for experiment in titles)]
+    figure = Figure((4.2 * len(titles), 0.32 * len(known) + 1.2), layout="constrained")
+    axes = figure.subplots(1, len(titles), sharey=True, squeeze=False)[0]
+    for experiment, panel in zip(titles, axes, strict=True):
+        panel.set_title(titles[experiment])
+        panel.set_yticks(range(len(known)), known)
+        panel.grid(axis="x", alpha=0.3)
+    axes[0].invert_yaxis()
+    return figure, [(experiment, panel, known) for experiment, panel in zip(titles, axes, strict=True)]
+
+
+def draw_errors(rows: dict[str, Rows]) -> Figure:
+    """MAE and RMSE of the rotation, and what the paper reports."""
+    figure, parts = panels(rows, ERRORS)
+    for experiment, panel, known in parts:
+        for place, name in enumerate(known):
+            if row := rows[experiment].get(name):
+                panel.plot([row["mae_r"], row["rmse_r"]], [place, place], color=BLUE, linewidth=1)
+                panel.plot(row["mae_r"], place, "o", color=BLUE, label="MAE")
+                panel.plot(row["rmse_r"], place, "o", color=BLUE, fillstyle="none", label="RMSE")
+            if reported := PAPER[experiment].get(name):
+                panel.plot(reported[1], place, "x", color=VERMILLION, label="MAE in the paper")
+        panel.set_xscale("log")
+        panel.set_xlabel("degrees")
+    handles = {label: handle for handle, label in zip(*parts[0][1].get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3)
+    return figure
+
+
+def draw_recalls(rows: dict[str, Rows]) -> Figure:
+    """Share of pairs within 5 degrees and 0.05, of all shapes and of those without an axis of symmetry."""
+    figure, parts = panels(rows, RECALLS)
+    for experiment, panel, known in parts:
+        for place, name in enumerate(known):
+            if row := rows[experiment].get(name):
+                panel.barh(place - 0.2, row["recall"], 0.38, color=BLUE, label="all shapes")
+                panel.barh(place + 0.2, row["observable_recall"], 0.38, color=ORANGE, label="without axisymmetric ones")
+        panel.set_xlim(0, 1)
+        panel.set_xlabel("share within 5 degrees and 0.05")
+    handles = {label: handle for handle, label in zip(*parts[0][1].get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+def main() -> None:
+    """Draw what there are rows for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("records", type=Path, nargs="+")
+    arguments = parser.parse_args()
+    rows = read_rows(arguments.records)
+    for name, titles, draw in (("errors", ERRORS, draw_errors), ("practice", RECALLS, draw_recalls)):
+        if titles.keys() <= rows.keys():
+            with look():
+                print(*save(draw(rows), arguments.folder / name))
+
+
+if __name__ == "__main__":
+    main()

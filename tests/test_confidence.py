@@ -1,0 +1,78 @@
+"""How sure a registration is, and why it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from idam.confidence import CLOSE, SLIGHT, Evidence, confidence, doubt, features
+
+CLEAR = Evidence(overlap=0.95, support=0.7, margin=0.9)
+"""A clean pair with much overlap."""
+NOTHING = Evidence(overlap=0.0, support=0.0, margin=0.0)
+GRID = [float(x) for x in np.linspace(0, 1, 6)]
+
+
+def test_confidence_is_a_probability() -> None:
+    for overlap, support, margin in np.random.default_rng(0).uniform(size=(50, 3)):
+        assert 0.0 < confidence(Evidence(overlap, support, margin)) < 1.0
+
+
+@pytest.mark.parametrize("name", ["overlap", "support", "margin"])
+@pytest.mark.parametrize("base", [CLEAR, NOTHING])
+def test_confidence_does_not_fall_as_the_evidence_grows(name: str, base: Evidence) -> None:
+    grown = [confidence(replace(base, **{name: x})) for x in GRID]
+    assert grown == sorted(grown)
+
+
+def test_confident_of_a_clean_pair_and_not_of_nothing() -> None:
+    assert confidence(CLEAR) > 0.9
+    assert confidence(NOTHING) < 0.5
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.5, 1.0])
+def test_not_confident_where_clouds_barely_touch_and_no_match_agrees(margin: float) -> None:
+    assert confidence(Evidence(overlap=0.05, support=0.0, margin=margin)) < 0.5
+
+
+def test_absurd_evidence_does_not_overflow() -> None:
+    for extreme in (-1e300, 1e300):
+        assert 0.0 <= confidence(replace(CLEAR, overlap=extreme)) <= 1.0
+
+
+def test_first_matches_that_agree_say_more_than_the_last() -> None:
+    supports = [features(replace(CLEAR, support=x))[1] for x in GRID]
+    assert supports[0] == 0.0
+    assert supports[-1] == 1.0
+    assert (np.diff(supports, 2) < 0).all()
+
+
+# --- doubt ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("evidence", "reason"),
+    [
+        (replace(CLEAR, margin=0.9 * CLOSE), "two poses explain the data equally well"),
+        (replace(CLEAR, overlap=0.9 * SLIGHT), "overlap about 22 %"),
+        (replace(CLEAR, support=0.0), "few of the feature matches agree with the answer"),
+        (replace(CLEAR, margin=CLOSE, overlap=SLIGHT), "few of the feature matches agree with the answer"),
+    ],
+)
+def test_doubt_names_what_is_wrong(evidence: Evidence, reason: str) -> None:
+    assert doubt(evidence) == reason
+
+
+def test_two_poses_are_named_before_little_overlap() -> None:
+    assert "two poses" in doubt(NOTHING)
+    assert doubt(replace(NOTHING, margin=1.0)) == "overlap about 0 %"
+
+
+def test_doubt_goes_into_a_sentence() -> None:
+    for overlap, support, margin in np.random.default_rng(0).uniform(0, 0.5, size=(20, 3)):
+        reason = doubt(Evidence(overlap, support, margin))
+        assert reason[0].islower()
+        assert not reason.endswith(".")
+        assert "\n" not in reason
