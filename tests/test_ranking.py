@@ -8,7 +8,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from idam.consensus import FeatureMatches
+from idam.consensus import FEW, FeatureMatches
 from idam.pyramid import Surfaces
 from idam.ranking import TOUCHING, Answer, alike, distinct, improve
 from idam.refine import Refinable
@@ -116,14 +116,14 @@ def test_improve_without_refinement_only_scores(surfaces: Surfaces, matches: Fea
         expected = agreement(surfaces.source, surfaces.target, start, TOUCHING * surfaces.spacing)
         assert a.overlap == expected.score
     assert max(found, key=lambda a: a.score) is found[2]
-    assert found[2].support == pytest.approx(2 / 3)
+    assert found[2].support == pytest.approx(20 / (30 + FEW))
 
 
 def test_improve_refines_each_and_scores_what_it_refined(surfaces: Surfaces, matches: FeatureMatches) -> None:
     unrefined, refined = (improve(list(map(Answer, STARTS)), surfaces, matches, 4.0, m) for m in ("none", "gicp"))
     assert len(refined) == len(STARTS)
     assert refined[1].overlap > 0.7 > 0.5 > unrefined[1].overlap
-    assert refined[1].support == pytest.approx(2 / 3)
+    assert refined[1].support == pytest.approx(20 / (30 + FEW))
     # the truth itself, and the one that started near it
     for a in refined[1:3]:
         assert np.degrees(Rotation.from_matrix(a.transformation[:3, :3]).magnitude()) < 1.0
