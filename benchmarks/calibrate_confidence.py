@@ -70,14 +70,18 @@ def register_all(count: int, seed: int) -> tuple[Array, Array, list[str]]:
 
 
 def fit(evidence: Array, right: Array) -> Array:
-    """Bias and weights of the logistic function, by maximum likelihood with a little shrinkage."""
+    """Bias and weights of the logistic function, by maximum likelihood with a little shrinkage.
+
+    No weight is negative: more of any evidence must not make an answer less sure.
+    """
     design = np.c_[np.ones(len(evidence)), evidence]
 
     def loss(w: Array) -> float:
         logit = design @ w
         return float((np.logaddexp(0, logit) - right * logit).sum() + 0.01 * (w[1:] ** 2).sum())
 
-    return np.asarray(minimize(loss, np.zeros(design.shape[1])).x)
+    bounds = [(None, None)] + [(0.0, None)] * evidence.shape[1]
+    return np.asarray(minimize(loss, np.zeros(design.shape[1]), method="L-BFGS-B", bounds=bounds).x)
 
 
 def probability(w: Array, evidence: Array) -> Array:
@@ -95,8 +99,9 @@ def draw(path: Path, said: Array, right: Array) -> None:
     figure = Figure((9, 4), dpi=120, layout="constrained")
     left, beside = figure.subplots(1, 2)
     left.plot([0, 1], [0, 1], color="0.6", linewidth=1)
-    left.plot(curve.predicted, curve.observed, "o-", color=BLUE)
-    left.set(xlabel="confidence", ylabel="share right", title=f"calibration error {curve.error:.3f}")
+    left.scatter(curve.predicted, curve.observed, 10 + 4 * curve.count, color=BLUE, alpha=0.8)
+    title = f"calibration error {curve.error:.3f}; larger dots stand for more pairs"
+    left.set(xlabel="confidence", ylabel="share right", title=title)
     order = np.argsort(-said, kind="stable")
     answered = np.arange(1, len(said) + 1)
     beside.plot(answered / len(said), 1 - np.cumsum(right[order]) / answered, color=ORANGE)
