@@ -40,9 +40,9 @@ def rival(name: str, voxel: float) -> Register:
     o3d = import_module("open3d")
     registration = o3d.pipelines.registration
     settings = {
-        "fpfh-ransac": [f"normal_radius={2 * voxel}", f"feature_radius={5 * voxel}", f"ransac_distance={1.5 * voxel}"],
-        "fgr": [f"normal_radius={2 * voxel}", f"feature_radius={5 * voxel}", f"fgr_distance={0.5 * voxel}"],
-        "kiss-matcher": [f"voxel_size={voxel}"],
+        "fpfh-ransac": ["normal_radius=2", "feature_radius=5", "ransac_distance=1.5", "ransac_edges=0.9"],
+        "fgr": ["normal_radius=2", "feature_radius=5", "fgr_distance=0.5"],
+        "kiss-matcher": ["voxel_size=1"],
     }[name]
     method = build_method(name, settings=settings)
 
@@ -51,11 +51,14 @@ def rival(name: str, voxel: float) -> Register:
             o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
             for points in (source, target)
         ]
-        # float32 is what the methods of the tables take: near the origin, where it can tell millimetres apart
+        # in voxels, since KISS-Matcher takes none of millimetres; and near the origin, for float32's sake
         centres = [np.asarray(cloud.points).mean(0) for cloud in clouds]
-        small = [(np.asarray(c.points) - centre).astype(np.float32) for c, centre in zip(clouds, centres, strict=True)]
+        small = [
+            ((np.asarray(cloud.points) - centre) / voxel).astype(np.float32)
+            for cloud, centre in zip(clouds, centres, strict=True)
+        ]
         start = method(*small)
-        start[:3, 3] += centres[1] - start[:3, :3] @ centres[0]
+        start[:3, 3] = voxel * start[:3, 3] + centres[1] - start[:3, :3] @ centres[0]
         clouds[1].estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
         plane = registration.TransformationEstimationPointToPlane()
         return np.array(registration.registration_icp(*clouds, 1.5 * voxel, start, plane).transformation), None

@@ -25,6 +25,8 @@ TOUCHING = 1.5
 """Spacings within which two surfaces count as touching."""
 
 
+ITERATIONS = 12
+"""Of the refinement before an answer is scored: right ones have come near by then, wrong ones may never."""
 CHANCE = 0.01
 """Share of the feature matches that a wrong answer brings together by chance."""
 
@@ -58,7 +60,7 @@ def improve(
         transformation = answer.transformation
         if method != "none":
             transformation, _ = refine(
-                surfaces.source, surfaces.target, transformation, reach * surfaces.spacing, method
+                surfaces.source, surfaces.target, transformation, reach * surfaces.spacing, method, ITERATIONS
             )
         overlap = agreement(surfaces.source, surfaces.target, transformation, TOUCHING * surfaces.spacing).score
         improved.append(Answer(transformation, overlap, matches.support(transformation)))

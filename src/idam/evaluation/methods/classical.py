@@ -30,6 +30,7 @@ class Settings:
         fgr_anneal: whether it shrinks its robust kernel down to that distance, without which the distance says nothing.
         ransac_distance: RANSAC's largest distance of an inlier.
         ransac_iterations: RANSAC's largest number of iterations.
+        ransac_edges: how alike the edges of a sample must be in both clouds to be tried, as a share; 0 to try them all.
         icp_after: largest distance of a match of an ICP that follows the method; 0 for none.
     """
 
@@ -41,6 +42,7 @@ class Settings:
     fgr_anneal: bool = False
     ransac_distance: float = 0.05
     ransac_iterations: int = 100_000
+    ransac_edges: float = 0.0
     icp_after: float = 0.0
 
 
@@ -129,7 +131,7 @@ def _ransac(o3d: Any, source: Any, target: Any, settings: Settings) -> Any:
         settings.ransac_distance,
         registration.TransformationEstimationPointToPoint(),
         3,
-        [],
+        [registration.CorrespondenceCheckerBasedOnEdgeLength(settings.ransac_edges)] if settings.ransac_edges else [],
         registration.RANSACConvergenceCriteria(settings.ransac_iterations, 0.999),
     )
 
