@@ -27,11 +27,20 @@ INTRODUCTION = """# Results
 
 Every figure here was computed by the command below its table; the paper's own figures stand in brackets. RMSE and MAE
 are over the zyx Euler angles, in degrees, and the coordinates of the translation; recall is the share of pairs within
-5 degrees and 0.05. Times are medians of one pair at a time on the machine named; rows of one table ran one after the
-other, so compare times in [the efficiency benchmark](../benchmarks/speed.py), which interleaves them. A name that ends
-in `-paper` is the network with the paper's inference (3 iterations, N/6 points, no further tries); one that ends in
-`-tuned` is a rival with settings chosen on validation pairs, beside the published ones. Go-ICP ran on the first pairs
-only, as their number says.
+5 degrees and 0.05. Rows of fewer pairs than others ran on the first so many, for time. Times in these tables are
+medians of one pair at a time on a busy machine: compare those under Efficiency, which were interleaved on an idle one.
+
+- A name that ends in `-paper` is the network with the paper's inference (3 iterations, N/6 points, no further tries).
+- One that ends in `-tuned` is a rival with settings chosen on validation pairs, beside the published ones.
+- `pointnetlk` and `dcp` are our implementations, trained for 12 minutes of one core each (753 and 88 steps of 8 pairs),
+  where their authors trained for hours on a GPU: read them as a beginning, not as those methods' worth. `prnet`, at
+  12 seconds a step there, learned nothing in that time and has no row yet.
+- `register` knows of no limit to the rotation, and finds a symmetric shape's other pose at times: one such pair of 180
+  degrees makes most of its RMSE, where MAE and recall say more.
+
+![Errors of each row](images/errors.png)
+
+![Recall on pairs closer to practice](images/practice.png)
 """
 
 
@@ -77,6 +86,30 @@ def real_scans(record: dict[str, Any]) -> str:
     return "\n".join(["## Real scans", "", record["table"], "", about])
 
 
+def scale(sizes: list[dict[str, float]]) -> str:
+    """Time and memory of ``register`` as the clouds grow."""
+    cells = ["points of each cloud", "seconds", "peak GB", "error, degrees"]
+    lines = ["## Scale", "", line(cells), line(["---"] * len(cells))]
+    for size in sizes:
+        figures = f"{size['seconds']:.2f}", f"{size['peak_gigabytes']:.2f}", f"{size['degrees']:.3f}"
+        lines.append(line([f"{size['points']:,.0f}", *figures]))
+    return "\n".join([*lines, "", "- `python benchmarks/scale.py`, on the machine of the table above."])
+
+
+def confidences(record: dict[str, Any]) -> str:
+    """What the confidence was fitted to, and how well."""
+    return "\n".join(
+        [
+            "## Confidence",
+            "",
+            "![Reliability, and risk against coverage](images/confidence.png)",
+            "",
+            f"- `python {record['about']}`: calibration error {record['calibration_error']:.3f} on the "
+            f"{len(record['pairs']) // 2} pairs held back.",
+        ]
+    )
+
+
 def line(cells: list[str]) -> str:
     """One line of a table in Markdown."""
     return "| " + " | ".join(cells) + " |"
@@ -86,11 +119,14 @@ def main() -> None:
     """Print the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("records", type=Path, nargs="+")
-    records = [json.loads(path.read_text()) for path in parser.parse_args().records]
+    files = [json.loads(path.read_text()) for path in parser.parse_args().records]
+    records = [content for content in files if isinstance(content, dict)]
     tables = [[r for r in records if r.get("pairs_from") == experiment] for experiment in TITLES]
     sections = [table(group) for group in tables if group]
     sections += [efficiency(record) for record in records if "median_ms" in record]
+    sections += [scale(content) for content in files if isinstance(content, list)]
     sections += [real_scans(record) for record in records if "sure" in record]
+    sections += [confidences(record) for record in records if "calibration_error" in record]
     print(INTRODUCTION)
     print("\n\n".join(sections))
 
