@@ -127,3 +127,16 @@ def test_only_the_network_s_rows_have_weights_of_their_own():
     assert network.weights_for("gnn-idam", "no such experiment") is None
     assert network.weights_for("icp", "unseen-shapes") is None
     assert network.weights_for("register", "unseen-shapes") is None
+
+
+def test_icp_after_the_network_brings_copies_of_a_cloud_together(weights):
+    source = np.random.default_rng(0).standard_normal((200, 3)).astype(np.float32)
+    found = build_method("gnn-idam-icp", weights)(source, source)
+    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-6)
+    alone = build_method("gnn-idam", weights)(source, source)
+
+    def miss(transform: np.ndarray) -> float:
+        moved = source @ transform[:3, :3].T + transform[:3, 3]
+        return float(np.linalg.norm(moved[:, None] - source, axis=-1).min(1).mean())
+
+    assert miss(found) <= miss(alone)

@@ -41,6 +41,7 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "gnn-idam-paper": ("network:gnn", PAPER),
     "fpfh-idam": ("network:fpfh", ()),
     "gnn-idam": ("network:gnn", ()),
+    "gnn-idam-icp": ("network:gnn_then_icp", ()),
     "register": ("pipeline:build", ()),
     **dict.fromkeys(ABLATION, ("network:ablation", PAPER)),
 }

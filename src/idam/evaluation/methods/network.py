@@ -13,9 +13,13 @@ from idam.errors import InputError
 from idam.evaluation.methods import ABLATION, RIVALS, Method
 from idam.evaluation.methods.learned.weights import rival_weights_for
 from idam.network.pretrained import list_models, load_model
+from idam.refine import Refinable, refine
 from idam.settings import with_settings
 
-__all__ = ["ablation", "as_method", "fpfh", "gnn", "weights_for"]
+__all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
+
+ICP_DISTANCE = 0.1
+"""Largest distance of a match of ICP after the network, in the units of shapes in the unit sphere."""
 
 
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
@@ -26,6 +30,17 @@ def gnn(model: str | None, settings: Sequence[str]) -> Method:
 def fpfh(model: str | None, settings: Sequence[str]) -> Method:
     """The network on FPFH features; ``fpfh-unseen-shapes`` unless another model is named."""
     return _alone(model or "fpfh-unseen-shapes", settings)
+
+
+def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
+    """The network on GNN features, and point-to-point ICP after it."""
+    network = gnn(model, settings)
+
+    def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
+        moving, fixed = (Refinable.build(cloud.astype(np.float64)) for cloud in (source, target))
+        return refine(moving, fixed, network(source, target), ICP_DISTANCE, "point")[0]
+
+    return run
 
 
 def ablation(model: str | None, settings: Sequence[str]) -> Method:
