@@ -303,7 +303,7 @@ def evaluate(
     pairs: Annotated[Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="Rows to compute; all if left out.")] = None,
     model: Annotated[
-        str | None, typer.Option(help="Weights for the idam rows; those trained for the experiment if left out.")
+        str | None, typer.Option(help="Weights for the learned rows; those trained for the experiment if left out.")
     ] = None,
     settings: Annotated[
         list[str] | None,
