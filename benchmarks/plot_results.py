@@ -27,18 +27,24 @@ Rows = dict[str, dict[str, Any]]
 
 
 def read_rows(paths: list[Path]) -> dict[str, Rows]:
-    """The rows of each experiment by method, of all files."""
+    """The rows of each experiment by label, of all files."""
     rows: dict[str, Rows] = {}
     for record in (json.loads(path.read_text()) for path in paths):
         if "pairs_from" in record:
-            found = {row["method"]: row for row in record["rows"] if "missing" not in row}
+            found = {label(row): row for row in record["rows"] if "missing" not in row}
             rows[record["pairs_from"]] = rows.get(record["pairs_from"], {}) | found
     return rows
 
 
+def label(row: dict[str, Any]) -> str:
+    """The method's name, with the model where it is not the method's own choice."""
+    return f"register ({row['model']})" if row["method"] == "register" and row["model"] else str(row["method"])
+
+
 def panels(rows: dict[str, Rows], titles: dict[str, str]) -> tuple[Figure, list[tuple[str, Any, list[str]]]]:
     """A figure with a panel for each experiment, and the methods that all panels list, in the tables' order."""
-    known = [name for name in METHODS if any(name in rows[experiment] for experiment in titles)]
+    places = {name: row["method"] for experiment in titles for name, row in rows[experiment].items()}
+    known = sorted(places, key=lambda name: list(METHODS).index(places[name]))
     figure = Figure((4.2 * len(titles), 0.32 * len(known) + 1.2), layout="constrained")
     axes = figure.subplots(1, len(titles), sharey=True, squeeze=False)[0]
     for experiment, panel in zip(titles, axes, strict=True):
