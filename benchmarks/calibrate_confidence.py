@@ -23,6 +23,7 @@ from scipy.optimize import minimize
 import idam
 from idam.confidence import features
 from idam.data.parts import View, partial_views, random_part
+from idam.evaluation.metrics import motion_error
 from idam.figures.curves import calibrate
 
 FILE = Path(idam.__file__).parent / "confidence.json"
@@ -50,10 +51,8 @@ def make_view(rng: np.random.Generator) -> tuple[View, str]:
 
 def is_right(estimate: Array, view: View) -> bool:
     """Within 5 degrees, and 0.05 at the source's centre."""
-    cosine = (np.trace(estimate[:3, :3].T @ view.transformation[:3, :3]) - 1) / 2
-    centre = np.append(view.source.mean(0), 1.0)
-    shift = np.linalg.norm((estimate @ centre - view.transformation @ centre)[:3])
-    return bool(cosine >= np.cos(np.radians(5)) and shift <= 0.05)
+    degrees, shift = motion_error(estimate, view.transformation, view.source.mean(0))
+    return degrees <= 5 and shift <= 0.05
 
 
 def register_all(count: int, seed: int) -> tuple[Array, Array, list[str]]:

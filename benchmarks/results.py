@@ -10,6 +10,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import scans
+
 from idam.evaluation.methods import METHODS
 from idam.evaluation.runner import Row
 from idam.evaluation.table import columns
@@ -82,8 +84,9 @@ def efficiency(record: dict[str, Any]) -> str:
 
 def real_scans(record: dict[str, Any]) -> str:
     """Success over pairs of real scans."""
-    about = f"- `benchmarks/scans.py`: {record['date'][:10]}, {record['processor']}. {record['sure']}"
-    return "\n".join(["## Real scans", "", record["table"], "", about])
+    pairs = record["records"]
+    about = f"- `benchmarks/scans.py`: {record['date'][:10]}, {record['processor']}. {scans.claim(pairs)}"
+    return "\n".join(["## Real scans", "", scans.table(pairs), "", about])
 
 
 def scale(sizes: list[dict[str, float]]) -> str:
@@ -125,7 +128,7 @@ def main() -> None:
     sections = [table(group) for group in tables if group]
     sections += [efficiency(record) for record in records if "median_ms" in record]
     sections += [scale(content) for content in files if isinstance(content, list)]
-    sections += [real_scans(record) for record in records if "sure" in record]
+    sections += [real_scans(record) for record in records if "records" in record]
     sections += [confidences(record) for record in records if "calibration_error" in record]
     print(INTRODUCTION)
     print("\n\n".join(sections))

@@ -22,11 +22,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 import idam
 from idam.data.parts import View, partial_views, random_part
+from idam.evaluation.metrics import motion_error
 
 KEEP = 0.75
 """Share of the surface in each view."""
@@ -66,20 +65,13 @@ def measure(folder: str, repeats: int) -> Measured:
         result = idam.register(source, target)
         times.append((time.perf_counter() - started[0], time.process_time() - started[1]))
     seconds, cpu_seconds = map(statistics.median, zip(*times, strict=True))
-    degrees, shift = errors(result.transformation, truth, source.mean(0))
+    degrees, shift = motion_error(result.transformation, truth, source.mean(0))
     return Measured(len(source), seconds, cpu_seconds, peak_gigabytes(), degrees, shift, result.confidence)
 
 
 def peak_gigabytes() -> float:
     """The most memory this process has had, which Linux tells in KiB and macOS in bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
-
-
-def errors(found: NDArray[np.float64], truth: NDArray[np.float64], centre: NDArray[np.float64]) -> tuple[float, float]:
-    """Degrees between two transforms, and how far apart they lay the source's centre."""
-    degrees = np.degrees(Rotation.from_matrix(found[:3, :3].T @ truth[:3, :3]).magnitude())
-    apart = (found - truth) @ [*centre, 1.0]
-    return float(degrees), float(np.linalg.norm(apart))
 
 
 def measure_apart(points: int, seed: int, repeats: int) -> Measured:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import idam
 from idam.evaluation.methods import build_method
+from idam.evaluation.metrics import motion_error
 from idam.evaluation.record import processor
 from idam.io import read_point_cloud
 
@@ -74,10 +75,8 @@ def ours(source: Points, target: Points) -> tuple[Points, float]:
 
 def is_right(estimate: Points, truth: Points, centroid: Points, success: dict[str, float]) -> bool:
     """Whether a transform is within the success limits."""
-    cosine = (np.trace(estimate[:3, :3].T @ truth[:3, :3]) - 1) / 2
-    difference = estimate - truth
-    shift = np.linalg.norm(difference[:3, :3] @ centroid + difference[:3, 3])
-    return bool(cosine >= np.cos(np.radians(success["rotation_deg"])) and shift <= success["centroid_shift"])
+    degrees, shift = motion_error(estimate, truth, centroid)
+    return degrees <= success["rotation_deg"] and shift <= success["centroid_shift"]
 
 
 def run(folder: Path, voxel: float) -> list[dict[str, Any]]:
@@ -123,6 +122,12 @@ def table(records: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def claim(records: list[dict[str, Any]]) -> str:
+    """How many of the confident answers are right."""
+    sure = [r["right"] for r in records if r["confidence"] is not None and r["confidence"] >= 0.9]
+    return f"Of {len(sure)} answers of confidence 0.9 and more, {sum(sure)} are right."
+
+
 def main() -> None:
     """Measure, print, and write with --json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -132,14 +137,10 @@ def main() -> None:
     arguments = parser.parse_args()
     voxels = VOXEL_SIZES | {name: float(size) for name, size in (text.split("=") for text in arguments.voxel_size)}
     records = [record for folder in arguments.folders for record in run(folder, voxels[folder.name])]
-    success = table(records)
-    print(success)
-    sure = [r["right"] for r in records if r["confidence"] is not None and r["confidence"] >= 0.9]
-    claim = f"Of {len(sure)} answers of confidence 0.9 and more, {sum(sure)} are right."
-    print(f"\n{claim}")
+    print(f"{table(records)}\n\n{claim(records)}")
     if arguments.json is not None:
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        about = {"date": date, "processor": processor(), "idam": idam.__version__, "table": success, "sure": claim}
+        about = {"date": date, "processor": processor(), "idam": idam.__version__}
         arguments.json.write_text(json.dumps({**about, "records": records}, indent=1))
 
 

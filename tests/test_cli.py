@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import idam
-from idam import RegistrationResult, cli, registration
+from idam import RegistrationResult, cli, registration, view
 from idam.io import PointCloud, format_transform, read_point_cloud, read_transform, write_point_cloud
 from idam.network.pretrained import provenance
 
@@ -223,7 +223,7 @@ def test_refuses_a_plot_it_cannot_draw(work: Path, call: Call, calls: list[Any],
 def test_plot_without_matplotlib_names_the_pip_command(
     work: Path, call: Call, calls: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "find_spec", lambda _: None)
+    monkeypatch.setattr(view, "find_spec", lambda _: None)
     assert_refused(
         call("register", "source.ply", "target.xyz", "--save-plot", "look.png"), "pip install 'idam[figures]'"
     )

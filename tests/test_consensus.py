@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.distance import cdist
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from idam import consensus
@@ -20,19 +19,9 @@ from idam.consensus import (
     match_features,
     mutual_matches,
 )
+from motions import move, rigid
 
 TOLERANCE = 0.02
-
-
-def rigid(rotation_vector: list[float], translation: list[float]) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.1, 0.2, -0.3])

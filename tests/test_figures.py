@@ -30,8 +30,9 @@ from matplotlib.colors import to_hex  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.text import Text  # noqa: E402
 
+from idam.figures.panels import project  # noqa: E402
 from idam.figures.plot_curves import draw_calibration, draw_iterations, draw_timings  # noqa: E402
-from idam.figures.plot_scenes import draw_key_points, draw_matches, draw_overlays, project  # noqa: E402
+from idam.figures.plot_scenes import draw_key_points, draw_matches, draw_overlays  # noqa: E402
 from idam.figures.style import GREEN, VERMILLION, look, save  # noqa: E402
 
 

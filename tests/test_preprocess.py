@@ -18,6 +18,7 @@ from idam.preprocess import (
     voxels,
     without_strays,
 )
+from motions import move, rigid
 
 ORIGIN = np.zeros(3)
 UTM = np.array([5e5, 5.6e6, 100.0])
@@ -40,17 +41,6 @@ def source(random: np.random.Generator) -> np.ndarray:
 def target(source: np.ndarray) -> np.ndarray:
     """A smaller part of the sheet, elsewhere."""
     return source[source[:, 0] > -0.5] @ Rotation.from_rotvec([0.2, -0.9, 0.4]).as_matrix().T + [4.0, -2.0, 7.0]
-
-
-def rigid(rotvec: list[float], translation: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def refusal(points: np.ndarray, name: str = "a.ply") -> str:

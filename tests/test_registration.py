@@ -29,6 +29,7 @@ from idam.ranking import alike
 from idam.refine import METHODS
 from idam.registration import as_rigid, finish, in_input_units, smaller_first
 from idam.result import Matches
+from motions import move
 
 UTM = np.array([5e5, 5.6e6, 100.0])
 SETTLED = 0.2
@@ -40,10 +41,6 @@ def rigid(rotation: Rotation, translation: Any) -> np.ndarray:
     matrix[:3, :3] = rotation.as_matrix()
     matrix[:3, 3] = translation
     return matrix
-
-
-def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> float:

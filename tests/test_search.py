@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from idam import search as searching
@@ -20,18 +19,7 @@ from idam.pyramid import Pyramid, build_pyramid
 from idam.ranking import Answer, alike
 from idam.result import Matches
 from idam.search import HYPOTHESES, STARTS, Found, examine, inverse, ranked, search, settle
-
-
-def rigid(rotation_vector: list[float], translation: list[float]) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
-
+from motions import move, rigid
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.02, -0.01, 0.03])
 FAR = rigid([0.4, 0.2, -0.1], [9.0, 0.0, 0.0])

@@ -7,7 +7,6 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -162,10 +161,11 @@ def register(
 
 def check_drawable(path: Path) -> None:
     """Find out before the work whether a picture can be drawn there."""
+    from idam.view import check_matplotlib
+
     if path.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"{path}: unknown picture format '{path.suffix}': the ones to draw are .png, .svg")
-    if find_spec("matplotlib") is None:
-        raise MissingDependencyError("drawing a result needs Matplotlib: pip install 'idam[figures]'")
+    check_matplotlib("a result")
 
 
 @contextmanager
@@ -296,7 +296,8 @@ def evaluate(
     experiment: Annotated[
         str | None,
         typer.Argument(
-            help="unseen-shapes, unseen-categories, gaussian-noise, practice or practice-any-rotation; or give --pairs."
+            help="unseen-shapes, unseen-categories, gaussian-noise, ablation, practice or practice-any-rotation; "
+            "or give --pairs."
         ),
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")] = None,

@@ -9,6 +9,7 @@ for two that agree by chance, so that even a few per cent of right matches stand
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -53,10 +54,16 @@ class FeatureMatches:
     target: Tensor
     tolerance: float
 
+    @cached_property
+    def points(self) -> tuple[Points, Points]:
+        """Source and target, (M, 3) each, as every transform is tried on them: in float64."""
+        return self.source.double().numpy(), self.target.double().numpy()
+
     def weights(self, transformation: Points) -> Points:
         """How well a transform (4, 4) brings each match together, (M,): 1 at no distance, 0 from its reach on."""
-        moved = self.source.double().numpy() @ transformation[:3, :3].T + transformation[:3, 3]
-        miss = np.linalg.norm(moved - self.target.double().numpy(), axis=1) / (REACH * self.tolerance)
+        source, target = self.points
+        moved = source @ transformation[:3, :3].T + transformation[:3, 3]
+        miss = np.linalg.norm(moved - target, axis=1) / (REACH * self.tolerance)
         return np.asarray((1 - miss**2).clip(0))
 
     def support(self, transformation: Points) -> float:

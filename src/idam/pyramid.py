@@ -91,25 +91,25 @@ def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> P
     if voxel_size is None:
         matching = _level(fine.source, fine.target, MATCHING_POINTS)
         small = _level(dense.source, dense.target, NETWORK_POINTS)
+        _check_number(small.source, small.target)
     else:
         voxel_size = max(voxel_size, FINEST)
         few = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
-        _check_number(few[0], few[1], DENSE_POINTS)
+        _check_number(*few)
         small = matching = Level(few[0], few[1], max(map(_spacing, few)))
-    _check_number(small.source, small.target, DENSE_POINTS)
     return Pyramid(small, matching, dense, fine)
 
 
-def _check_number(source: Points, target: Points, most: int) -> None:
+def _check_number(source: Points, target: Points) -> None:
     for name, points in (("source", source), ("target", target)):
         if len(points) < MIN_POINTS:
             raise InputError(
                 f"{name}: {len(points)} points are left at the network's resolution, at least {MIN_POINTS} are needed; "
                 "crop the other cloud to its size, or give a smaller voxel_size"
             )
-        if len(points) > most:
+        if len(points) > DENSE_POINTS:
             raise InputError(
-                f"{name}: {len(points)} points are left at this voxel_size, at most {most} fit the network; "
+                f"{name}: {len(points)} points are left at this voxel_size, at most {DENSE_POINTS} fit the network; "
                 "give a larger voxel_size"
             )
 

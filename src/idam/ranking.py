@@ -67,10 +67,12 @@ def improve(
     return improved
 
 
-def distinct(answers: Iterable[Answer]) -> list[Answer]:
-    """The answers without those that are like an earlier one."""
+def distinct(answers: Iterable[Answer], most: int | None = None) -> list[Answer]:
+    """The answers without those that are like an earlier one, the first ``most`` of them."""
     kept: list[Answer] = []
     for answer in answers:
+        if len(kept) == most:
+            break
         if not any(alike(answer.transformation, other.transformation) for other in kept):
             kept.append(answer)
     return kept

@@ -75,7 +75,7 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         method: of refinement, or ``none``.
     """
     matches = match_features(clouds.matching.source, clouds.matching.target, clouds.matching.spacing)
-    agreed = distinct(Answer(transform) for transform in [guess, *agreeing_transforms(matches)])[:HYPOTHESES]
+    agreed = distinct(map(Answer, [guess, *agreeing_transforms(matches)]), HYPOTHESES)
     log.info("%d feature matches, sets of which agree on %d transforms", len(matches.source), len(agreed) - 1)
     answers = settle(agreed, clouds, matches, 2.0, method)
     found = examine(answers, matches)
@@ -107,4 +107,4 @@ def examine(answers: list[Answer], matches: FeatureMatches) -> Found:
     evidence = Evidence(best.overlap, best.support, margin)
     weight = matches.weights(best.transformation)
     weight /= weight.sum() or 1.0
-    return Found(answers, Matches(matches.source.double().numpy(), matches.target.double().numpy(), weight), evidence)
+    return Found(answers, Matches(*matches.points, weight), evidence)

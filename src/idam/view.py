@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["approach", "chance", "frame", "guess_up", "sample"]
+from idam.errors import MissingDependencyError
+
+__all__ = ["approach", "chance", "check_matplotlib", "frame", "guess_up", "sample"]
 
 Points = NDArray[np.float64]
+
+
+def check_matplotlib(what: str) -> None:
+    """Raise MissingDependencyError where what is to be drawn, such as ``figures``, lacks Matplotlib."""
+    if find_spec("matplotlib") is None:
+        raise MissingDependencyError(f"drawing {what} needs Matplotlib: pip install 'idam[figures]'")
 
 
 def sample(points: Points, count: int) -> Points:

@@ -23,8 +23,8 @@ from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
 from idam import __version__
-from idam.data.modelnet40 import load
-from idam.errors import InputError, MissingDependencyError
+from idam.data.modelnet40 import import_h5py, load
+from idam.errors import InputError
 from idam.io.files import one_line, write_json
 
 __all__ = ["MODELNET40_URL", "fetch_modelnet40"]
@@ -93,10 +93,7 @@ def _check_request(url: str, sha256: str | None) -> None:
         InputError: the URL or the checksum is none.
         MissingDependencyError: h5py is not installed.
     """
-    try:
-        import h5py  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError("reading ModelNet40 needs h5py: pip install 'idam[train]'") from error
+    import_h5py()
     try:
         known = urlsplit(url).scheme in ("http", "https", "file")
     except ValueError:

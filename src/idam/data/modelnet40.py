@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from idam.errors import InputError, MissingDependencyError
 
-__all__ = ["Shapes", "experiment_shapes", "load"]
+__all__ = ["Shapes", "experiment_shapes", "import_h5py", "load"]
 
 POINTS = 1024
 """Points used of each shape (section 4)."""
@@ -32,6 +33,15 @@ class Shapes:
         return Shapes(self.points[mask], self.labels[mask])
 
 
+def import_h5py() -> Any:
+    """The module that reads the files; raise MissingDependencyError where it is not installed."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise MissingDependencyError("reading ModelNet40 needs h5py: pip install 'idam[train]'") from error
+    return h5py
+
+
 def load(folder: str | Path, split: str) -> Shapes:
     """Read the ``train`` or ``test`` split.
 
@@ -44,10 +54,7 @@ def load(folder: str | Path, split: str) -> Shapes:
         InputError: the folder or one of its files is missing or not in that layout.
         MissingDependencyError: h5py is not installed.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingDependencyError("reading ModelNet40 needs h5py: pip install 'idam[train]'") from error
+    h5py = import_h5py()
     folder = Path(folder)
     if (folder / "modelnet40_ply_hdf5_2048").is_dir():
         folder = folder / "modelnet40_ply_hdf5_2048"

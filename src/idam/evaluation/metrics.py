@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from idam.data.pairs import Pairs
 from idam.geometry import apply_transform, nearest, rotation_angle, rotation_to_euler_zyx
 
-__all__ = ["Metrics", "measure", "modified_chamfer"]
+__all__ = ["Metrics", "measure", "modified_chamfer", "motion_error"]
 
 RECALL_ANGLE = 5.0
 RECALL_DISTANCE = 0.05
@@ -43,6 +46,15 @@ class Metrics:
     def to_dict(self) -> dict[str, float]:
         """The figures by name."""
         return asdict(self)
+
+
+def motion_error(
+    found: NDArray[np.float64], truth: NDArray[np.float64], centre: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Degrees between two transforms (4, 4), and how far apart they lay the source's centre (3,)."""
+    degrees = np.degrees(Rotation.from_matrix(found[:3, :3].T @ truth[:3, :3]).magnitude())
+    apart = (found - truth) @ [*centre, 1.0]
+    return float(degrees), float(np.linalg.norm(apart))
 
 
 def measure(rotation: Tensor, translation: Tensor, true_rotation: Tensor, true_translation: Tensor) -> Metrics:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from idam.data.modelnet40 import Shapes, experiment_shapes
-from idam.errors import MissingDependencyError
 from idam.evaluation.experiments import test_set
 from idam.figures.categories import category_names, one_of_each, spread, up_axis
 from idam.figures.curves import calibrate, observe
@@ -19,6 +17,7 @@ from idam.figures.timings import Timings, read_timings
 from idam.io import make_folder
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model
+from idam.view import check_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,8 +67,7 @@ def draw_figures(
         InputError: there is no such model, the data or a file cannot be read, or the folder cannot be written.
         MissingDependencyError: Matplotlib or h5py is not installed.
     """
-    if find_spec("matplotlib") is None:
-        raise MissingDependencyError("drawing figures needs Matplotlib: pip install 'idam[figures]'")
+    check_matplotlib("figures")
     from idam.figures.style import look, save
 
     # whatever is wrong with the input shows before the work

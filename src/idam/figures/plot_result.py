@@ -1,4 +1,4 @@
-"""One registration as a picture: the pair before, the network's matches, the pair after. Imports Matplotlib."""
+"""One registration as a picture: the pair before, the feature matches, the pair after. Imports Matplotlib."""
 
 from __future__ import annotations
 

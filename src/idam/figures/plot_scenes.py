@@ -14,7 +14,7 @@ from idam.figures.panels import dot, draw_clouds, empty_grid, head, legend, proj
 from idam.figures.scenes import Kept, Matches, Overlay
 from idam.figures.style import BLUE, GREEN, GREY, ORANGE, PAGE, VERMILLION
 
-__all__ = ["draw_key_points", "draw_matches", "draw_overlays", "project"]
+__all__ = ["draw_key_points", "draw_matches", "draw_overlays"]
 
 DASHES = (0, (4, 2))
 RATIO = 5 / 3
@@ -49,14 +49,8 @@ def draw_overlays(overlays: Sequence[Overlay], up: int) -> Figure:
 
 def draw_key_points(shapes: Sequence[Kept], up: int) -> Figure:
     """Clouds in grey with their key points in colour, four to a row; ``up`` is the axis that points up."""
-    columns = min(len(shapes), 4)
-    rows = math.ceil(len(shapes) / columns)
-    side = PAGE / columns
-    figure = Figure((PAGE, rows * (side + 0.05) + 0.2), layout="constrained")
-    grid = empty_grid(figure, rows, columns)
-    for n, shape in enumerate(shapes):
-        axes = grid[n // columns][n % columns]
-        head(axes, shape.name, side)
+    figure, panels = _named_panels([shape.name for shape in shapes], 4, 1.0, between=0.05, below=0.2)
+    for axes, shape in zip(panels, shapes, strict=True):
         draw_clouds(axes, (project(shape.cloud, up), GREY))
         draw_clouds(axes, (project(shape.key_points, up), BLUE), size=4.0, palest=0.3)
         same_scale([axes])
@@ -66,20 +60,31 @@ def draw_key_points(shapes: Sequence[Kept], up: int) -> Figure:
 
 def draw_matches(shapes: Sequence[Matches], up: int) -> Figure:
     """Source left or above, target right or below, matches between, two shapes to a row; ``up`` points up."""
-    columns = min(len(shapes), 2)
-    rows = math.ceil(len(shapes) / columns)
-    side = PAGE / columns
-    figure = Figure((PAGE, rows * (side / RATIO + 0.2) + 0.4), layout="constrained")
-    grid = empty_grid(figure, rows, columns)
-    for n, shape in enumerate(shapes):
-        axes = grid[n // columns][n % columns]
-        head(axes, shape.name, side)
+    figure, panels = _named_panels([shape.name for shape in shapes], 2, RATIO, between=0.2, below=0.4)
+    for axes, shape in zip(panels, shapes, strict=True):
         _draw_shape_matches(axes, shape, up)
         same_scale([axes], RATIO)
     weighted = Line2D([], [], color=GREEN, label="match with weight")
     others = Line2D([], [], color=VERMILLION, linestyle=DASHES, label="match without")
     legend(figure, [weighted, others], TURNED_BACK)
     return figure
+
+
+def _named_panels(
+    names: list[str], most: int, ratio: float, *, between: float, below: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure as wide as the page with a panel for each name, ``most`` to a row, each ``ratio`` times as wide as high.
+
+    ``between`` inches are left for each row's names, and ``below`` for the legend.
+    """
+    columns = min(len(names), most)
+    rows = math.ceil(len(names) / columns)
+    side = PAGE / columns
+    figure = Figure((PAGE, rows * (side / ratio + between) + below), layout="constrained")
+    panels = [axes for row in empty_grid(figure, rows, columns) for axes in row][: len(names)]
+    for axes, name in zip(panels, names, strict=True):
+        head(axes, name, side)
+    return figure, panels
 
 
 def _draw_shape_matches(axes: Axes, shape: Matches, up: int) -> None:
