@@ -35,8 +35,9 @@ from idam.network.pretrained import save_weights
 from idam.training.batches import generator_at, pairs_at, split_validation
 from idam.training.checkpoint import Progress, history, restore, save_checkpoint
 from idam.training.log import Log
-from idam.training.loop import check_batch, check_finite, check_installed, check_run, validate
+from idam.training.loop import check_batch, check_finite, check_installed, check_run
 from idam.training.recipe import TRAININGS, Recipe, check
+from idam.training.task import PairTask, validate
 
 RIVALS: dict[str, type[Rival]] = {rival.name: rival for rival in (PointNetLK, DCP, PRNet)}
 DROPS = (0.3, 0.6, 0.8)
@@ -85,6 +86,12 @@ class Training:
     validation: Pairs
     output: Path
     command: str
+    data = PairTask.data
+
+    @property
+    def held(self) -> str:
+        """What is validated on."""
+        return f"{len(self.validation)} shapes held out of the training split"
 
     def step(self, pairs: Pairs, rate: float, log: Log, done: int) -> None:
         """One step of Adam."""
@@ -107,7 +114,7 @@ class Training:
         options = asdict(self.plan)
         if scores.mae_r < self.progress.best:
             self.progress.best = scores.mae_r
-            told = history(self.plan.experiment, options, self.progress, scores, len(self.validation), self.command)
+            told = history(self.plan.experiment, options, self.progress, scores, self, self.command)
             save_weights(self.output / "best.safetensors", self.network, self.network.config, told)
         save_checkpoint(self.output / "last.ckpt", self.network, self.optimizer, self.progress, options)
 

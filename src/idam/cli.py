@@ -222,7 +222,7 @@ def models() -> None:
 def train(
     experiment: Annotated[str, typer.Argument(help="For what: a table of 'evaluate', or general.")],
     data: Data,
-    features: Annotated[str, typer.Option(help="Point features: gnn or fpfh.")] = "gnn",
+    features: Annotated[str, typer.Option(help="Point features: gnn, fpfh or invariant.")] = "gnn",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the weights and the log.")] = None,
     epochs: Annotated[float, typer.Option(help="Passes over the training shapes; may be a fraction.")] = 40,
     batch_size: Annotated[int, typer.Option(help="Pairs a step, over all processes.")] = 16,

@@ -13,7 +13,7 @@ from idam.errors import InputError
 from idam.preprocess import MIN_POINTS, choose_voxel_size, downsample
 from idam.refine import Refinable
 
-__all__ = ["Level", "Pyramid", "Surfaces", "build_pyramid"]
+__all__ = ["Level", "Pyramid", "Surfaces", "build_pyramid", "level"]
 
 Points = NDArray[np.float64]
 
@@ -86,11 +86,11 @@ def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> P
     Raises:
         InputError: too few or too many points are left at the coarse levels.
     """
-    fine = _level(source, target, FINE_POINTS)
-    dense = _level(fine.source, fine.target, DENSE_POINTS)
+    fine = level(source, target, FINE_POINTS)
+    dense = level(fine.source, fine.target, DENSE_POINTS)
     if voxel_size is None:
-        matching = _level(fine.source, fine.target, MATCHING_POINTS)
-        small = _level(dense.source, dense.target, NETWORK_POINTS)
+        matching = level(fine.source, fine.target, MATCHING_POINTS)
+        small = level(dense.source, dense.target, NETWORK_POINTS)
         _check_number(small.source, small.target)
     else:
         voxel_size = max(voxel_size, FINEST)
@@ -114,7 +114,7 @@ def _check_number(source: Points, target: Points) -> None:
             )
 
 
-def _level(source: Points, target: Points, count: int) -> Level:
+def level(source: Points, target: Points, count: int) -> Level:
     """Both clouds on one voxel grid that leaves about ``count`` points of the larger."""
     voxel_size = choose_voxel_size([source, target], count)
     if voxel_size > 0:

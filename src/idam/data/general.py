@@ -1,145 +1,191 @@
-"""Pairs as practice has them: any rotation, other points, partial views, clutter, noise; drawn without end.
+"""Pairs of scans as practice has them: any rotation, other points, partial views, noise, strays; drawn without end.
 
-Where the paper's protocol crops two copies of the same points, here each scan samples the surface anew: some by another
-density, some seen from a viewpoint that hides what lies behind, some of several objects on a ground. Both clouds are
-centred as :func:`idam.register` centres them, so that the network sees in training what it sees in use.
+Where the paper's protocol crops two copies of the same points, here each scan samples the surface anew: a thing seen
+from a few viewpoints, a room, a street as a spinning LiDAR sees it, or half of a ModelNet40 shape's points. Both go
+through the same centring, scaling and voxel grid as in :func:`idam.register`, so that a network sees in training what
+it sees in use.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from idam.data.pairs import Pairs
-from idam.geometry import gather_points, nearest_neighbours, quaternion_to_rotation, random_rotation, rotations_within
+from idam.data.surfaces import random_room, random_street, random_thing
+from idam.data.visibility import seen_from_afar, seen_from_within
+from idam.preprocess import common_frame, without_strays
+from idam.pyramid import level
 
-__all__ = ["in_any_pose", "make_general_pairs"]
+__all__ = ["Material", "ScanPair", "draw_scans", "load_meshes"]
 
-POINTS = 640
-"""Points of each cloud."""
-CANDIDATES = 1536
-"""Points of each cloud before parts of it are hidden."""
-NEIGHBOURS = 6
-"""Nearest neighbours that span the triangles a scan's points are drawn from."""
-MAX_NOISE = 0.02
-MAX_OUTLIERS = 0.04
-LEAST_KEPT = 0.55
-"""Least share of a cloud that its half-space keeps: two of these overlap by a tenth or more."""
-SCENES = 0.35
-"""Share of pairs that are several objects on a ground."""
-VIEWS = 0.5
-"""Share of clouds that are seen from a viewpoint; the others are seen from all sides."""
-CORE = 0.98
-"""Share of a cloud's points that decide its size."""
-GRID = 40
-"""Cells along each axis of the image that decides what a viewpoint hides."""
+Points = NDArray[np.float64]
+Draw = Callable[["Material", np.random.Generator], "tuple[Points, Points] | None"]
 
-BEHIND = 0.15
-"""How far a point must lie behind another to be hidden by it."""
+DENSE = 60_000
+"""Points of a thing before it is scanned; rooms and streets have twice as many."""
+FEWEST = 120
+"""Points of each scan at least."""
+COUNTS, SHARES = (600, 1000, 1500, 2000), (0.1, 0.25, 0.35, 0.3)
+"""Points of the larger scan, about, and how often each number is drawn."""
+NOISE, MUCH_NOISE = 0.008, 0.02
+"""Largest sigmas, in a thing's radii, of most pairs and of every fifth."""
+STRAYS = 0.006
+"""Largest share of points that are strays, in every third scan."""
+LEAST_OVERLAP, MORE_OVERLAP = 0.05, 0.2
+"""A pair is drawn again where it overlaps less than a share drawn from between these."""
+TOUCHING = 1.2
+"""Spacings within which surfaces overlap."""
+RANGE = 2.2
+"""How far a street's LiDAR sees."""
 
 
-def make_general_pairs(points: Tensor, generator: torch.Generator, max_angle: float = math.pi) -> Pairs:
-    """Pairs from whole shapes (B, N, 3), drawn from ``generator`` as one batch.
+@dataclass(frozen=True)
+class Material:
+    """What surfaces are made of, besides our own: ModelNet40 shapes (S, N, 3), and trimesh meshes."""
 
-    Args:
-        points: shapes, about as large as the unit sphere.
-        generator: on the CPU.
-        max_angle: largest angle of the rotation, radians; pi for all of SO(3).
+    shapes: NDArray[np.float32]
+    meshes: Sequence[Any] = ()
+
+
+@dataclass(frozen=True)
+class ScanPair:
+    """Two scans in working coordinates, ready for features.
+
+    Attributes:
+        source: (N, 3).
+        target: (P, 3).
+        transformation: the truth (4, 4), source to target.
+        spacing: of their points.
+        overlap: share of the cloud that overlaps less.
     """
-    count = len(points)
-    surface = _scenes(in_any_pose(points, generator), generator)
-    neighbours = nearest_neighbours(surface, NEIGHBOURS)
-    source, target = (_scan(_sampled_anew(surface, neighbours, generator), generator) for _ in range(2))
-    rotation = rotations_within(count, max_angle, generator)
-    # each cloud about its own mean, and both of unit size, as in use
-    centres = [cloud.mean(1, keepdim=True) for cloud in (source, target)]
-    source, target = source - centres[0], target - centres[1]
-    radius = torch.maximum(*(cloud.norm(dim=-1).quantile(CORE, dim=-1) for cloud in (source, target)))[:, None, None]
-    between = (centres[0] - centres[1]) / radius
-    turn = rotation.transpose(-1, -2)
-    return Pairs(source / radius, target / radius @ turn, rotation, (between @ turn).squeeze(1))
+
+    source: Points
+    target: Points
+    transformation: Points
+    spacing: float
+    overlap: float
 
 
-def _uniform(shape: tuple[int, ...], low: float, high: float, generator: torch.Generator) -> Tensor:
-    return torch.rand(shape, generator=generator) * (high - low) + low
+def load_meshes(folder: Path) -> list[Any]:
+    """The triangle meshes (``.ply``) of a folder; none where there is no such folder."""
+    import trimesh
+
+    return [trimesh.load(path, process=False) for path in sorted(folder.glob("*.ply"))]
 
 
-def in_any_pose(points: Tensor, generator: torch.Generator) -> Tensor:
-    """The shapes (B, N, 3), each turned in some way: in practice there is no common upright."""
-    return points @ random_rotation(len(points), generator=generator).transpose(-1, -2)
+def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
+    """A pair of scans, a function of the generator's state."""
+    kinds: list[Draw] = [_halves, _views_of_a_thing, _views_of_a_room, _views_of_a_street]
+    while True:
+        drawn = kinds[rng.choice(len(kinds), p=(0.2, 0.45, 0.2, 0.15))](material, rng)
+        if drawn is None:
+            continue
+        pair = _as_scanned(*drawn, rng)
+        if pair is not None and pair.overlap >= rng.uniform(LEAST_OVERLAP, MORE_OVERLAP):
+            return pair
 
 
-def _scenes(points: Tensor, generator: torch.Generator) -> Tensor:
-    """Some of the shapes (B, N, 3) with another beside them and a ground below, as large, of as many points."""
-    count, number = points.shape[:2]
-    thirds = number // 3
-    aside = torch.nn.functional.normalize(torch.randn(count, 1, 3, generator=generator), dim=-1)
-    other = points.roll(1, 0) * _uniform((count, 1, 1), 0.5, 1.0, generator)
-    other = other + aside * _uniform((count, 1, 1), 0.9, 1.6, generator)
-    ground = _uniform((count, number - 2 * thirds, 3), -1.6, 1.6, generator)
-    ground[..., 2] = -_uniform((count, 1), 0.3, 1.0, generator)
-    scene = torch.cat([points[:, :thirds], other[:, :thirds], ground], 1)
-    scene = scene - scene.mean(1, keepdim=True)
-    scene = scene / scene.norm(dim=-1).amax(-1)[:, None, None]
-    chosen = torch.rand(count, 1, 1, generator=generator) < SCENES
-    return torch.where(chosen, scene, points)
+def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Points]:
+    """Disjoint halves of a shape's points, each cropped by a half-space."""
+    points = material.shapes[rng.integers(len(material.shapes))].astype(np.float64)
+    points = points[rng.permutation(len(points))]
+    first, second = np.array_split(points, 2)
+    return first[_below(first, 0.55, rng)], second[_below(second, 0.55, rng)]
 
 
-def _sampled_anew(surface: Tensor, neighbours: Tensor, generator: torch.Generator) -> Tensor:
-    """Other points (B, 1536, 3) of the surfaces: in the triangles of a point (B, N, 3) and two neighbours (B, N, k)."""
-    count, number = surface.shape[:2]
-    corner = torch.randint(number, (count, CANDIDATES), generator=generator)
-    others = torch.randint(NEIGHBOURS, (2, count, CANDIDATES, 1), generator=generator)
-    near = gather_points(neighbours, corner)
-    corners = [gather_points(surface, rows) for rows in (corner, *(near.gather(2, o).squeeze(2) for o in others))]
-    share = torch.empty(3, count, CANDIDATES, 1).exponential_(generator=generator)
-    return sum((s * c for s, c in zip(share / share.sum(0), corners, strict=True)), torch.zeros(()))
+def _views_of_a_thing(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """A thing from all around, or as one or three viewpoints see it, those of the two scans 10 to 130 degrees apart."""
+    points = random_thing(DENSE, rng, material.meshes) @ Rotation.random(random_state=rng).as_matrix().T
+    axis = rng.normal(size=3)
+    apart = np.radians(rng.uniform(10, 130)) * axis / np.linalg.norm(axis)
+    first = Rotation.random(random_state=rng)
+    masks = []
+    around = rng.random() < 0.25
+    for side in (first, first * Rotation.from_rotvec(apart)):
+        if around:
+            masks.append(_below(points, 0.4, rng))
+            continue
+        number = rng.choice([1, 3], p=[0.7, 0.3])
+        views = [side * Rotation.from_rotvec(0.25 * rng.normal(size=3)) for _ in range(number)]
+        seen = np.any([seen_from_afar(points, view.as_matrix(), int(rng.integers(60, 110))) for view in views], 0)
+        masks.append(seen & _below(points, 0.5, rng) if rng.random() < 0.4 else seen)
+    return _sampled_apart(points, masks, rng)
 
 
-def _scan(surface: Tensor, generator: torch.Generator) -> Tensor:
-    """One scan (B, 640, 3) of surfaces (B, N, 3): part of the points, unevenly dense, with noise and outliers."""
-    count = len(surface)
-    chance = _inside_half_space(surface, generator) * _seen(surface, generator) * _density(surface, generator)
-    # Gumbel's trick: the largest of log chance + noise are a sample without replacement
-    noise = -torch.empty(chance.shape).exponential_(generator=generator).log()
-    index = (chance.clamp_min(1e-30).log() + noise).topk(POINTS).indices
-    # where fewer are left than wanted, some come twice, apart by their noise
-    left = (chance > 0).sum(-1, keepdim=True)
-    index = index.gather(1, torch.arange(POINTS).expand(count, -1) % left.clamp(1, POINTS))
-    scan = gather_points(surface, index)
-    sigma = _uniform((count, 1, 1), 0.0, MAX_NOISE, generator)
-    scan = scan + torch.randn(scan.shape, generator=generator) * sigma
-    stray = _uniform(scan.shape, -1.0, 1.0, generator)
-    outlier = torch.rand(count, POINTS, generator=generator) < _uniform((count, 1), 0.0, MAX_OUTLIERS, generator)
-    return torch.where(outlier.unsqueeze(-1), stray, scan)
+def _views_of_a_room(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """A room as a camera with a wide field of view sees it from one to three places."""
+    points, places = random_room(2 * DENSE, rng, material.meshes)
+    masks = []
+    for _ in range(2):
+        seen = np.zeros(len(points), bool)
+        for place in rng.permutation(places)[: rng.integers(1, 4)]:
+            look = rng.normal(size=3) * (1, 1, 0.4)
+            ray = points - place
+            ahead = ray @ look / (np.linalg.norm(ray, axis=1) * np.linalg.norm(look))
+            seen |= seen_from_within(points, place) & (ahead > np.cos(np.radians(rng.uniform(40, 90))))
+        masks.append(seen)
+    return _sampled_apart(points, masks, rng)
 
 
-def _inside_half_space(surface: Tensor, generator: torch.Generator) -> Tensor:
-    """1 for the points (B, N) lowest along a random direction, a random share of them, 0 for the others."""
-    along = (surface @ torch.randn(len(surface), 3, 1, generator=generator)).squeeze(-1)
-    share = _uniform((len(surface), 1), LEAST_KEPT, 1.0, generator)
-    rank = along.argsort(-1).argsort(-1)
-    return (rank < share * surface.shape[1]).float()
+def _views_of_a_street(_: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """A street as a spinning LiDAR sees it from two places: the farther, the sparser."""
+    points, places = random_street(2 * DENSE, rng)
+    first = int(rng.integers(len(places) - 2))
+    masks = []
+    for place in places[[first, first + int(rng.integers(1, 3))]]:
+        ray = points - place
+        distance = np.linalg.norm(ray, axis=1)
+        within = (distance < RANGE) & (ray[:, 2] < 0.25 * distance)
+        masks.append(seen_from_within(points, place) & within & (rng.random(len(points)) < 0.5 / distance**2))
+    return _sampled_apart(points, masks, rng)
 
 
-def _seen(surface: Tensor, generator: torch.Generator) -> Tensor:
-    """1 for the points (B, N) that a viewpoint far away sees, 0 for those behind others; some are seen all around."""
-    count = len(surface)
-    turned = surface @ quaternion_to_rotation(torch.randn(count, 4, generator=generator)).transpose(-1, -2)
-    cell = ((turned[..., :2] + 1) * (GRID / 2)).long().clamp_(0, GRID - 1)
-    cell = cell[..., 0] * GRID + cell[..., 1]
-    # the surface is thin in the image: each cell also hides what lies behind its neighbours
-    depth = torch.full((count, GRID * GRID), torch.inf).scatter_reduce(1, cell, turned[..., 2], "amin")
-    depth = -torch.nn.functional.max_pool2d(-depth.view(count, 1, GRID, GRID), 3, 1, 1).flatten(1)
-    seen = turned[..., 2] < depth.gather(1, cell) + BEHIND
-    around = torch.rand(count, 1, generator=generator) >= VIEWS
-    return (seen | around).float()
+def _below(points: Points, least: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which points (N, 3) a random half-space keeps: a share of ``least`` or more."""
+    along = points @ rng.normal(size=3)
+    kept: NDArray[np.bool_] = along <= np.quantile(along, rng.uniform(least, 1))
+    return kept
 
 
-def _density(surface: Tensor, generator: torch.Generator) -> Tensor:
-    """Relative densities (B, N): as 1 / distance^2 from a sensor, near or far."""
-    direction = torch.nn.functional.normalize(torch.randn(len(surface), 1, 3, generator=generator), dim=-1)
-    sensor = direction * _uniform((len(surface), 1, 1), 1.5, 6.0, generator)
-    return 1 / (surface - sensor).square().sum(-1)
+def _sampled_apart(
+    points: Points, masks: list[NDArray[np.bool_]], rng: np.random.Generator
+) -> tuple[Points, Points] | None:
+    """Two scans of dense points (N, 3) by what each sees; no point is in both. None where they see too little."""
+    first = rng.random(len(points)) < 0.5
+    source, target = points[masks[0] & first], points[masks[1] & ~first]
+    if min(len(source), len(target)) < 10 * FEWEST:
+        return None
+    if rng.random() < 0.3:
+        source = source[rng.random(len(source)) < rng.uniform(0.3, 1)]
+    return source, target
+
+
+def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> ScanPair | None:
+    """Turned, with noise and strays, and as :func:`idam.register` sees them; None where too few points are left."""
+    sigma = rng.uniform(0, NOISE if rng.random() < 0.8 else MUCH_NOISE)
+    truth = np.eye(4)
+    truth[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    clouds = []
+    for cloud in (source, target):
+        noisy = cloud + sigma * rng.normal(size=cloud.shape)
+        stray = rng.random(len(noisy)) < (rng.uniform(0, STRAYS) if rng.random() < 0.3 else 0.0)
+        noisy[stray] += 0.3 * rng.normal(size=(stray.sum(), 3))
+        clouds.append(noisy)
+    source, target = clouds[0], clouds[1] @ truth[:3, :3].T
+    frame = common_frame(source, target)
+    count = int(rng.choice(COUNTS, p=SHARES))
+    scans = level(without_strays(frame.source(source)), without_strays(frame.target(target)), count)
+    if min(len(scans.source), len(scans.target)) < FEWEST:
+        return None
+    truth = frame.enter(truth)
+    reach = TOUCHING * scans.spacing
+    moved = scans.source @ truth[:3, :3].T + truth[:3, 3]
+    shares = [np.mean(cKDTree(a).query(b)[0] < reach) for a, b in ((scans.target, moved), (moved, scans.target))]
+    return ScanPair(scans.source, scans.target, truth, scans.spacing, float(min(shares)))

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from idam.data.general import in_any_pose
 from idam.data.pairs import MAX_ANGLE, MAX_TRANSLATION, NOISE, NOISE_CLIP, Pairs, drawn_singly
 from idam.geometry import (
     apply_transform,
     euler_xyz_to_rotation,
     gather_points,
     quaternion_to_rotation,
+    random_rotation,
     rotations_within,
 )
 
@@ -54,6 +54,11 @@ def make_practice_pairs(points: Tensor, generator: torch.Generator, max_angle: f
         return _build(points, draw, euler_xyz_to_rotation(draw.angles))
     # a network that is started from many rotations sees the target in all of its poses
     return _build(in_any_pose(points, generator), draw, rotations_within(len(points), max_angle, generator))
+
+
+def in_any_pose(points: Tensor, generator: torch.Generator) -> Tensor:
+    """The shapes (B, N, 3), each turned in some way: in practice there is no common upright."""
+    return points @ random_rotation(len(points), generator=generator).transpose(-1, -2)
 
 
 def fixed_practice_pairs(points: Tensor, seed: int, *, any_rotation: bool) -> Pairs:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from idam.data.general import make_general_pairs
 from idam.data.modelnet40 import Shapes
 from idam.data.pairs import EXPERIMENTS, Pairs, fixed_pairs, make_pairs
 from idam.data.practice import make_practice_pairs
@@ -46,8 +45,6 @@ def split_validation(shapes: Shapes, recipe: Recipe) -> tuple[Shapes, Pairs]:
 
 def draw_pairs(points: Tensor, recipe: Recipe, generator: torch.Generator) -> Pairs:
     """Pairs of whole shapes (B, N, 3) to train on."""
-    if recipe.experiment == "general":
-        return make_general_pairs(points, generator, recipe.max_angle)
     if recipe.experiment == "practice":
         return make_practice_pairs(points, generator)
     if recipe.experiment == "practice-any-rotation":

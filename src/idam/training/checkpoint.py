@@ -9,19 +9,37 @@ import subprocess
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import nn
 
 from idam.errors import InputError
-from idam.evaluation.metrics import Metrics
 from idam.io.files import one_line, write_bytes
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model
 from idam.training.recipe import Recipe
 
-__all__ = ["Progress", "history", "initial_model", "restore", "save_checkpoint"]
+__all__ = ["Origin", "Progress", "Scores", "history", "initial_model", "restore", "save_checkpoint"]
+
+
+class Scores(Protocol):
+    """What a validation found."""
+
+    def to_dict(self) -> dict[str, float]:
+        """All of it, by name."""
+
+
+class Origin(Protocol):
+    """What a model comes from: the pairs that it learns from, and those that it is validated on, in words."""
+
+    @property
+    def data(self) -> str:
+        """What the pairs are made of."""
+
+    @property
+    def held(self) -> str:
+        """What is validated on."""
 
 
 @dataclass
@@ -49,17 +67,17 @@ def initial_model(recipe: Recipe) -> IDAM:
 
 
 def history(
-    experiment: str, options: dict[str, Any], progress: Progress, scores: Metrics, pairs: int, command: str
+    experiment: str, options: dict[str, Any], progress: Progress, scores: Scores, origin: Origin, command: str
 ) -> dict[str, Any]:
     """The provenance of a model: what it was trained on, how far, and how it did on the validation pairs."""
     return {
         "experiment": experiment,
-        "data": "ModelNet40, 1024 points a shape, training split less the validation shapes",
+        "data": origin.data,
         "recipe": options,
         "steps": progress.step,
         "training_seconds": round(progress.seconds),
         "validation": {key: round(value, 5) for key, value in scores.to_dict().items()},
-        "validation_pairs": f"{pairs} shapes held out of the training split",
+        "validation_pairs": origin.held,
         "command": command,
         "commit": commit(),
         "torch": torch.__version__,

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from idam.evaluation.metrics import Metrics
+from idam.training.checkpoint import Scores
 
 __all__ = ["Log", "Parts"]
 
@@ -61,8 +61,8 @@ class Log:
             for name, value in figures.items():
                 self.writer.add_scalar(f"train/{name}", value, step)
 
-    def validation(self, step: int, scores: Metrics) -> None:
-        """Show the errors on the validation pairs."""
+    def validation(self, step: int, scores: Scores) -> None:
+        """Show what a validation found."""
         self.bar.console.print(
             f"step {step + 1}: " + " ".join(f"{k} {v:.4f}" for k, v in scores.to_dict().items()), soft_wrap=True
         )

@@ -10,21 +10,17 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from idam.data.modelnet40 import experiment_shapes
-from idam.data.pairs import Pairs
 from idam.errors import InputError, MissingDependencyError
-from idam.evaluation.metrics import Metrics, measure
 from idam.io import make_folder
 from idam.memory import keep_freed_memory
 from idam.network.pretrained import save_model
-from idam.network.supervision import Loss
-from idam.training.batches import batch_at, split_validation
-from idam.training.checkpoint import Progress, history, initial_model, restore, save_checkpoint
-from idam.training.log import Log
+from idam.training.checkpoint import Progress, history, restore, save_checkpoint
+from idam.training.general import GeneralTask
+from idam.training.log import Log, Parts
 from idam.training.recipe import Recipe, check
-from idam.training.step import SupervisedStep
+from idam.training.task import PairTask, Task
 
-__all__ = ["train", "validate"]
+__all__ = ["train"]
 
 
 def train(
@@ -71,10 +67,10 @@ def train(
     )
     fabric.launch()
     torch.manual_seed(recipe.seed)
-    shapes, validation = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe)
-    check_batch(recipe.batch_size, len(shapes), fabric.world_size)
-    total = max(1, round(recipe.epochs * (len(shapes) // recipe.batch_size)))
-    module = SupervisedStep(initial_model(recipe), recipe, precision)
+    task: Task = GeneralTask(recipe, data) if recipe.experiment == "general" else PairTask(recipe, data, precision)
+    check_batch(recipe.batch_size, task.size, fabric.world_size)
+    total = max(1, round(recipe.epochs * (task.size // recipe.batch_size)))
+    module = task.module
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     progress = restore(output / "last.ckpt", module.model, optimizer, asdict(recipe)) if resume else Progress()
     options = {name: value for name, value in asdict(recipe).items() if name != "config"}
@@ -84,8 +80,8 @@ def train(
         for step in range(progress.step, total):
             for group in step_optimizer.param_groups:
                 group["lr"] = recipe.rate(step / total)
-            batch = batch_at(shapes, recipe, step, fabric.global_rank, fabric.world_size)
-            loss: Loss = step_module(fabric.to_device(batch))
+            batch = task.batch(step, fabric.global_rank, fabric.world_size)
+            loss: Parts = step_module(fabric.to_device(batch))
             fabric.backward(loss.total)
             step_optimizer.step()
             step_optimizer.zero_grad()
@@ -94,33 +90,18 @@ def train(
                 check_finite(module, step)
                 progress.step, progress.seconds = step + 1, time.monotonic() - started
                 if fabric.is_global_zero:
-                    scores = validate(module.model, validation)
+                    error, scores = task.validate()
                     log.validation(step, scores)
-                    if scores.mae_r < progress.best:
-                        progress.best = scores.mae_r
+                    if error < progress.best:
+                        progress.best = error
                         save_model(
                             output / "best.safetensors",
                             module.model,
-                            history(recipe.experiment, options, progress, scores, len(validation), command),
+                            history(recipe.experiment, options, progress, scores, task, command),
                         )
                     save_checkpoint(output / "last.ckpt", module.model, optimizer, progress, asdict(recipe))
                 fabric.barrier()
     return output / "best.safetensors"
-
-
-@torch.inference_mode()
-def validate(model: nn.Module, pairs: Pairs, batch_size: int = 50) -> Metrics:
-    """Errors of the network alone on pairs; its output has a rotation and a translation."""
-    was_training, device = model.training, next(model.parameters()).device
-    model.eval()
-    estimates = []
-    for start in range(0, len(pairs), batch_size):
-        batch = pairs[start : start + batch_size].to(device)
-        output = model(batch.source, batch.target)
-        estimates.append((output.rotation.cpu(), output.translation.cpu()))
-    model.train(was_training)
-    rotation, translation = (torch.cat(parts) for parts in zip(*estimates, strict=True))
-    return measure(rotation, translation, pairs.rotation, pairs.translation)
 
 
 def check_installed() -> None:

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING
 from idam.errors import InputError
 from idam.network.features.fpfh import FPFH
 from idam.network.features.gnn import GNN
+from idam.network.features.invariant import Invariant
 
 if TYPE_CHECKING:
     from idam.network.config import Config
 
-__all__ = ["FPFH", "GNN", "build_features"]
+__all__ = ["FPFH", "GNN", "Invariant", "build_features"]
 
 
-def build_features(config: Config) -> GNN | FPFH:
+def build_features(config: Config) -> GNN | FPFH | Invariant:
     """The feature extractor that a configuration names.
 
     Raises:
@@ -24,4 +25,6 @@ def build_features(config: Config) -> GNN | FPFH:
         return GNN(config.neighbours)
     if config.features == "fpfh":
         return FPFH(normal_radius=config.normal_radius, feature_radius=config.feature_radius)
-    raise InputError(f"unknown features {config.features!r}: choose gnn or fpfh")
+    if config.features == "invariant":
+        return Invariant()
+    raise InputError(f"unknown features {config.features!r}: choose gnn, fpfh or invariant")

@@ -36,7 +36,7 @@ from idam.network.features.normals import (
     normals_from_neighbours,
 )
 
-__all__ = ["FPFH", "estimate_normals", "fpfh"]
+__all__ = ["FPFH", "estimate_normals", "fpfh", "fpfh_of_neighbours"]
 
 BINS = 11
 # Angles (radians) closer than this count as equal where the outcome jumps: on flat surfaces they often are, and then
@@ -64,7 +64,11 @@ def fpfh(points: Tensor, normals: Tensor, *, radius: float, max_neighbours: int)
         Features (B, N, 33), without gradient: 11 bins each of theta, phi and alpha, each 11 adding up to 200.
     """
     reach = Reach(radius, at_most=max_neighbours - 1)
-    return in_parts(lambda cloud, normal: _fpfh(cloud, normal, *find_neighbours(cloud, reach)), points, normals)
+
+    def describe(cloud: Tensor, normal: Tensor) -> Tensor:
+        return fpfh_of_neighbours(cloud, normal, *find_neighbours(cloud, reach))
+
+    return in_parts(describe, points, normals)
 
 
 class FPFH(nn.Module):
@@ -100,11 +104,11 @@ class FPFH(nn.Module):
 
     def _describe(self, points: Tensor) -> Tensor:
         near_for_normals, near = find_neighbours(points, self.normal_reach, self.feature_reach)
-        return _fpfh(points, normals_from_neighbours(points, near_for_normals), near)
+        return fpfh_of_neighbours(points, normals_from_neighbours(points, near_for_normals), near)
 
 
-def _fpfh(points: Tensor, normals: Tensor, near: Neighbours) -> Tensor:
-    """Features (B, N, 33) of ``points`` (B, N, 3) with ``normals`` (B, N, 3), by their neighbours."""
+def fpfh_of_neighbours(points: Tensor, normals: Tensor, near: Neighbours) -> Tensor:
+    """FPFH (B, N, 33) of ``points`` (B, N, 3) with ``normals`` (B, N, 3), by neighbourhoods found already."""
     shape = points.shape[:2]
     # coordinates first: sums over three slabs of pairs are several times as fast as sums over rows of three
     points, normals = points.flatten(0, 1).t().contiguous(), normals.flatten(0, 1).t().contiguous()

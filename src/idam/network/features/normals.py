@@ -18,9 +18,11 @@ from torch import Tensor
 __all__ = [
     "Neighbours",
     "Reach",
+    "among_nearest",
     "estimate_normals",
     "find_neighbours",
     "in_parts",
+    "nearest_neighbours_of",
     "normal_reach",
     "normals_from_neighbours",
 ]
@@ -102,6 +104,27 @@ def find_neighbours(points: Tensor, *reaches: Reach) -> list[Neighbours]:
         for found, reach in zip(pairs, reaches, strict=True):
             found.append(_select(distance.flatten(0, 1), reach).flatten().nonzero().squeeze(1) + start * size)
     return [_as_neighbours(torch.cat(found), batch, size) for found in pairs]
+
+
+def nearest_neighbours_of(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The ``count`` nearest others of every point (N, 3), fewer in a smaller cloud: distances and rows, (N, K) each."""
+    size = len(points)
+    rows = max(1, DISTANCES // size)
+    found = []
+    for start in range(0, size, rows):
+        distance = torch.cdist(points[start : start + rows], points, compute_mode="donot_use_mm_for_euclid_dist")
+        distance.diagonal(offset=start).fill_(torch.inf)
+        found.append(distance.topk(min(count, size - 1), largest=False))
+    return torch.cat([part.values for part in found]), torch.cat([part.indices for part in found])
+
+
+def among_nearest(distance: Tensor, near: Tensor, reach: Reach) -> Neighbours:
+    """Those of each point's nearest (N, K), by distance (N, K) from near to far, that are within reach."""
+    chosen = distance < reach.radius
+    chosen[:, : reach.at_least] = True
+    chosen[:, reach.at_most :] = False
+    centre, column = chosen.nonzero().unbind(1)
+    return Neighbours(centre, near[centre, column], chosen.sum(1))
 
 
 def _select(distance: Tensor, reach: Reach) -> Tensor:
