@@ -22,8 +22,9 @@ from idam.data.pairs import Pairs
 from idam.evaluation import experiments
 from idam.evaluation.experiments import TestSet
 from idam.evaluation.runner import Task, run
+from idam.network import pretrained
 from idam.network.pretrained import list_models, load_model, provenance
-from idam.training import Recipe, loop
+from idam.training import Recipe, loop, task
 from idam.training.batches import batch_at, split_validation
 from idam.training.checkpoint import initial_model
 from idam.training.step import SupervisedStep
@@ -149,9 +150,9 @@ def test_train_leaves_a_model_that_can_be_used(features, idam, trainable, tmp_pa
 
 
 def test_unseen_categories_are_not_trained_on(idam, trainable, tmp_path, monkeypatch):
-    labels, split = [], loop.split_validation
+    labels, split = [], task.split_validation
     monkeypatch.setattr(
-        loop, "split_validation", lambda shapes, *args: (labels.extend(shapes.labels), split(shapes, *args))[1]
+        task, "split_validation", lambda shapes, *args: (labels.extend(shapes.labels), split(shapes, *args))[1]
     )
     assert idam("train", "unseen-categories", "--data", trainable, "-o", tmp_path / "run", *FEW_STEPS).code == 0
     assert len(labels) == 11
@@ -425,5 +426,19 @@ def test_models_shows_every_model_and_where_it_comes_from_at_any_width(columns, 
         assert name in outcome.out
         for shown in (told["experiment"], told["steps"], told["recipe"]["seed"], told["commit"], told["command"]):
             assert str(shown) in outcome.out
-        for score in ("rmse_r", "mae_r"):
+        shown = told["validation"].keys() & {"rmse_r", "mae_r", "matching", "accuracy"}
+        assert len(shown) == 2
+        for score in shown:
             assert f"{told['validation'][score]:.3f}" in outcome.out
+
+
+def test_models_shows_how_well_features_match_where_that_is_what_was_validated(idam, monkeypatch):
+    scores = {"matching": 2.34567, "accuracy": 0.41234}
+    told = {"config": {"features": "invariant", "iterations": 1}, "experiment": "general", "validation": scores}
+    monkeypatch.setattr(pretrained, "list_models", lambda: ["mine"])
+    monkeypatch.setattr(pretrained, "provenance", lambda _: told)
+    outcome = idam("models")
+    assert outcome.code == 0
+    assert "accuracy 0.412, matching loss 2.346" in outcome.out
+    assert "nan" not in outcome.out
+    assert "RMSE(R)" not in outcome.out

@@ -50,7 +50,7 @@ def result(target: np.ndarray) -> RegistrationResult:
         converged=True,
         reason="",
         hypotheses=[],
-        evidence=Evidence(overlap=0.5, margin=0.2, support=0.9),
+        evidence=Evidence(overlap=0.5, support=0.9, likelihood=1.5, margin=0.2),
         max_correspondence_distance=0.05,
         information=np.zeros((6, 6)),
         matches=Matches(source[:60], target[:60], weight.clip(0) / weight.clip(0).sum()),

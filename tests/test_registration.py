@@ -171,7 +171,7 @@ def test_runners_up_are_other_transforms_that_score_less(result: RegistrationRes
         assert np.linalg.norm(move(other.transformation, CENTRE) - TARGET.mean(0)) < 1.5
 
 
-@pytest.mark.parametrize("evidence", [Evidence(0.9, 0.8, 0.9), Evidence(0.1, 0.01, 0.01), Evidence(0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("evidence", [Evidence(0.9, 0.8, 3.0, 0.9), Evidence(0.1, 0.01, 0.1, 0.01), Evidence(0.0, 0.0, 0.0, 0.0)])
 def test_reason_is_given_where_the_answer_is_not_to_count_on(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -62,7 +62,7 @@ def make_pair(
         converged=confidence >= 0.5,
         reason=reason,
         hypotheses=list(hypotheses),
-        evidence=Evidence(overlap=0.5, margin=0.2, support=0.9),
+        evidence=Evidence(overlap=0.5, support=0.9, likelihood=1.5, margin=0.2),
         max_correspondence_distance=0.05,
         information=np.zeros((6, 6)),
         matches=matches,

@@ -36,7 +36,7 @@ def result() -> RegistrationResult:
         confidence=0.9,
         converged=True,
         reason="",
-        evidence=Evidence(overlap=0.6, support=0.8, margin=0.2),
+        evidence=Evidence(overlap=0.6, support=0.8, likelihood=2.5, margin=0.2),
         hypotheses=[Hypothesis(np.diag([-1.0, -1, 1, 1]), 0.4), Hypothesis(np.diag([1.0, -1, -1, 1]), 0.3)],
         max_correspondence_distance=0.05,
         information=np.diag(np.arange(6.0)),
@@ -61,7 +61,7 @@ def test_to_dict_is_ready_for_json(result: RegistrationResult) -> None:
     assert content["transformation"] == result.transformation.tolist()
     assert content["information"] == result.information.tolist()
     assert content["correspondences"] == 3
-    assert content["evidence"] == {"overlap": 0.6, "support": 0.8, "margin": 0.2}
+    assert content["evidence"] == {"overlap": 0.6, "support": 0.8, "likelihood": 2.5, "margin": 0.2}
     assert content["hypotheses"] == [
         {"transformation": np.diag([-1.0, -1, 1, 1]).tolist(), "score": 0.4},
         {"transformation": np.diag([1.0, -1, -1, 1]).tolist(), "score": 0.3},

@@ -18,7 +18,6 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from idam.data import pairs as protocol
-from idam.data.general import POINTS
 from idam.data.modelnet40 import Shapes
 from idam.data.pairs import Pairs
 from idam.errors import InputError, MissingDependencyError
@@ -28,12 +27,12 @@ from idam.network.config import Config
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model, provenance, save_model
 from idam.network.supervision import Loss
-from idam.training import TRAININGS, Recipe, loop, train
+from idam.training import TRAININGS, Recipe, loop, task, train
 from idam.training import checkpoint as saving
 from idam.training.batches import Batch, batch_at, split_validation
 from idam.training.checkpoint import initial_model
-from idam.training.loop import validate
 from idam.training.step import SupervisedStep
+from idam.training.task import validate
 
 SMALL = Recipe(
     config=Config(neighbours=6, channels=8),
@@ -67,7 +66,7 @@ def fit(monkeypatch: pytest.MonkeyPatch, shapes: Shapes) -> Callable[..., list[L
     """Trains on the small shapes, stopped by Ctrl-C after a step if asked to, and returns the loss of every step."""
     pytest.importorskip("lightning_fabric", reason="training needs Lightning Fabric")
     pytest.importorskip("tensorboard", reason="training needs TensorBoard")
-    monkeypatch.setattr(loop, "experiment_shapes", lambda *_: shapes)
+    monkeypatch.setattr(task, "experiment_shapes", lambda *_: shapes)
     monkeypatch.setattr(loop, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
     monkeypatch.setattr(protocol, "CROPPED_POINTS", 96)
 
@@ -189,14 +188,13 @@ def test_the_split_depends_on_the_seed_alone(shapes):
     assert held_out(split_validation(shapes, changed(seed=4))[0]) != held_out(first)
 
 
-@pytest.mark.parametrize("features", ["gnn", "fpfh"])
-def test_general_pairs_are_drawn_as_far_apart_as_the_features_can_take(features, shapes):
-    recipe = changed(experiment="general", config=Config(features=features))
+@pytest.mark.parametrize("features", ["gnn", "fpfh", "invariant"])
+def test_practice_pairs_are_turned_as_far_as_the_features_can_take(features, shapes):
+    recipe = changed(experiment="practice-any-rotation", config=Config(features=features))
     train_shapes, validation = split_validation(shapes, recipe)
     batches = [batch_at(train_shapes, recipe, step, 0, 1) for step in range(12)]
     angles = rotation_angle(torch.cat([validation.rotation, *(batch.rotation for batch in batches)]))
-    assert (angles.max() > 90) == (features == "fpfh")
-    assert validation.source.shape == validation.target.shape == (4, POINTS, 3)
+    assert (angles.max() > 90) == (features != "gnn")
     assert torch.equal(batches[3].source, batch_at(train_shapes, recipe, 3, 0, 1).source)
     assert not torch.equal(batches[3].source, batches[4].source)
 
@@ -415,7 +413,7 @@ def test_the_checkpoint_with_the_least_rotation_error_is_kept(fit, tmp_path, mon
         seen.append((pairs, {name: value.clone() for name, value in model.state_dict().items()}))
         return Metrics(9, next(errors), 9, 9, 0, 9, 9)
 
-    monkeypatch.setattr(loop, "validate", scripted)
+    monkeypatch.setattr(task, "validate", scripted)
     fit(SMALL, tmp_path, validate_every=3)
     best = tmp_path / "best.safetensors"
     assert provenance(best)["steps"] == 6
@@ -613,7 +611,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one_and_nothing_else
 BAD_RECIPES = {
     "an unknown experiment": ({"experiment": "seen-shapes"}, ", ".join(TRAININGS)),
     "an unknown schedule": ({"schedule": "cosine"}, "step or one-cycle"),
-    "unknown features": ({"config": Config(features="sift")}, "gnn or fpfh"),
+    "unknown features": ({"config": Config(features="sift")}, "gnn, fpfh or invariant"),
     "no epochs": ({"epochs": 0}, "epochs"),
     "negative epochs": ({"epochs": -1}, "epochs"),
     "epochs that are no number": ({"epochs": math.nan}, "epochs"),

@@ -206,16 +206,24 @@ def models() -> None:
 
     for name in list_models():  # no table: names and commands are to be copied, whatever the terminal's width
         history = provenance(name)
-        config, scores = history["config"], history.get("validation", {})
+        config = history["config"]
         print(name)
         print(
             f"  {config['features']} features, {history.get('experiment', '')}, {config['iterations']} iterations, "
             f"{history.get('steps', '')} steps, seed {history.get('recipe', {}).get('seed', '')}, "
             f"commit {history.get('commit') or 'unknown'}"
         )
-        print(f"  RMSE(R) {scores.get('rmse_r', float('nan')):.3f}, MAE(R) {scores.get('mae_r', float('nan')):.3f}")
+        print(f"  {as_told(history.get('validation', {}))}")
         print(f"  {history.get('command', '')}")
-    print("Errors in degrees, network alone, on shapes held out of the training split.")
+    print("RMSE and MAE in degrees, network alone; accuracy: share of points whose best match is right.")
+    print("All on shapes held out of the training.")
+
+
+def as_told(scores: dict[str, float]) -> str:
+    """What a validation found, on a line: the errors of a registration, or how well features match."""
+    if "accuracy" in scores:
+        return f"accuracy {scores['accuracy']:.3f}, matching loss {scores.get('matching', float('nan')):.3f}"
+    return f"RMSE(R) {scores.get('rmse_r', float('nan')):.3f}, MAE(R) {scores.get('mae_r', float('nan')):.3f}"
 
 
 @app.command()
@@ -224,7 +232,7 @@ def train(
     data: Data,
     features: Annotated[str, typer.Option(help="Point features: gnn, fpfh or invariant.")] = "gnn",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the weights and the log.")] = None,
-    epochs: Annotated[float, typer.Option(help="Passes over the training shapes; may be a fraction.")] = 40,
+    epochs: Annotated[float, typer.Option(help="Passes over the training pairs; may be a fraction.")] = 40,
     batch_size: Annotated[int, typer.Option(help="Pairs a step, over all processes.")] = 16,
     schedule: Annotated[str, typer.Option(help="step (the paper's) or one-cycle.")] = "step",
     learning_rate: Annotated[float, typer.Option(help="Adam's, at its highest.")] = 1e-4,
@@ -249,7 +257,11 @@ def train(
     validate_every: Annotated[int, typer.Option(help="Steps between checkpoints.")] = 250,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
 ) -> None:
-    """Train a model; the defaults are the paper's recipe. Under torchrun it uses every process.
+    r"""Train a model; the defaults are the paper's recipe. Under torchrun it uses every process.
+
+    General training, on scans as practice has them, teaches features and significance alone: see the last example.
+
+    Its data may have a folder 'meshes' of .ply meshes besides. Noise, radius and keep play no part in it.
 
     [bold]Examples[/bold]
 
@@ -258,6 +270,9 @@ def train(
       idam train gaussian-noise --data modelnet40 --epochs 4 --schedule one-cycle --learning-rate 1e-3 --precision bf16
 
       torchrun --nproc-per-node 4 -m idam train unseen-shapes --data modelnet40
+
+      idam train general --data modelnet40 --features invariant --set convolution=false --set hybrid_elimination=false \
+      --set iterations=1 --set blocks=1 --epochs 6 --batch-size 4 --schedule one-cycle --learning-rate 2e-3
     """
     from idam.network.config import Config
     from idam.settings import with_settings

@@ -27,21 +27,25 @@ class Evidence:
     Attributes:
         overlap: agreement of the clouds under the answer, in [0, 1] (:class:`idam.scoring.Agreement`).
         support: share of the feature matches that the answer brings together, in [0, 1].
+        likelihood: how much likelier the features make the answer than chance
+            (:meth:`idam.matching.Matching.likelihood`).
         margin: by how much less the best other answer scores (:attr:`idam.ranking.Answer.score`), as a share.
     """
 
     overlap: float
     support: float
+    likelihood: float
     margin: float
 
 
-def features(evidence: Evidence) -> tuple[float, float, float]:
+def features(evidence: Evidence) -> tuple[float, float, float, float]:
     """What the logistic function is linear in.
 
     The first few matches that agree say more than the last; and an answer that explains little is not made sure by
     others that explain still less.
     """
-    return evidence.overlap, math.sqrt(evidence.support), min(evidence.margin, LITTLE * evidence.overlap)
+    margin = min(evidence.margin, LITTLE * evidence.overlap)
+    return evidence.overlap, math.sqrt(evidence.support), max(0.0, evidence.likelihood), margin
 
 
 def confidence(evidence: Evidence) -> float:

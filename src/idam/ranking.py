@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.consensus import FeatureMatches
+from idam.matching import TOUCHING, Matching
 from idam.pyramid import Surfaces
 from idam.refine import refine
 from idam.scoring import agreement
@@ -21,14 +21,10 @@ SAME_ANGLE = 10.0
 """Degrees within which two answers count as one."""
 SAME_SHIFT = 0.1
 """Distance within which two answers must lay the source's centre to count as one, in working units."""
-TOUCHING = 1.5
-"""Spacings within which two surfaces count as touching."""
-
-
 ITERATIONS = 12
 """Of the refinement before an answer is scored: right ones have come near by then, wrong ones may never."""
-CHANCE = 0.01
-"""Share of the feature matches that a wrong answer brings together by chance."""
+UNLIKELY = 0.05
+"""Overlap counts for so much where the features do not speak for an answer: on flat ground they say nothing."""
 
 
 @dataclass(frozen=True)
@@ -39,21 +35,21 @@ class Answer:
         transformation: (4, 4), working source to working target.
         overlap: agreement of the clouds under it, in [0, 1].
         support: share of the feature matches that it brings together, in [0, 1].
+        likelihood: how much likelier the features make it than chance (:meth:`idam.matching.Matching.likelihood`).
     """
 
     transformation: Points
     overlap: float = 0.0
     support: float = 0.0
+    likelihood: float = 0.0
 
     @property
     def score(self) -> float:
-        """What answers are ranked by: surfaces slid into wrong contact overlap, too, but few matches come along."""
-        return float(self.overlap * (self.support + CHANCE) ** 0.25)
+        """What answers are ranked by: surfaces slid into wrong contact overlap, too, but their points are not alike."""
+        return max(self.likelihood, 0.0) + UNLIKELY * self.overlap
 
 
-def improve(
-    answers: list[Answer], surfaces: Surfaces, matches: FeatureMatches, reach: float, method: str
-) -> list[Answer]:
+def improve(answers: list[Answer], surfaces: Surfaces, matching: Matching, reach: float, method: str) -> list[Answer]:
     """Each answer refined within ``reach`` spacings (unless the method is ``none``) and scored."""
     improved = []
     for answer in answers:
@@ -63,7 +59,8 @@ def improve(
                 surfaces.source, surfaces.target, transformation, reach * surfaces.spacing, method, ITERATIONS
             )
         overlap = agreement(surfaces.source, surfaces.target, transformation, TOUCHING * surfaces.spacing).score
-        improved.append(Answer(transformation, overlap, matches.support(transformation)))
+        support = matching.matches.support(transformation)
+        improved.append(Answer(transformation, overlap, support, matching.likelihood(transformation)))
     return improved
 
 

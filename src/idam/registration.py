@@ -33,6 +33,9 @@ log = logging.getLogger(__name__)
 
 Points = NDArray[np.float64]
 
+FEW_POINTS = 1024
+"""Points of the larger cloud up to which the last refinement ends point to point."""
+
 
 def register(
     source: Any,
@@ -157,11 +160,21 @@ def smaller_first(source: Points, target: Points) -> bool:
 
 
 def finish(transformation: Points, fine: Level, method: str) -> tuple[Points, NDArray[np.float64]]:
-    """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6)."""
+    """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6).
+
+    Normals of few points are coarse, and more so with noise: there the points themselves have the last word.
+    """
     if method == "none":
         return transformation, np.zeros((6, 6))
     surfaces = fine.surfaces
-    return refine_once(surfaces.source, surfaces.target, transformation, 2.0 * fine.spacing, method)
+    transformation, information = refine_once(
+        surfaces.source, surfaces.target, transformation, 2.0 * fine.spacing, method
+    )
+    if method == "gicp" and max(len(fine.source), len(fine.target)) <= FEW_POINTS:
+        transformation, _ = refine_once(
+            surfaces.source, surfaces.target, transformation, fine.spacing, "point", iterations=100
+        )
+    return transformation, information
 
 
 def in_input_units(matches: Matches, frame: Frame) -> Matches:

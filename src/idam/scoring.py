@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from idam.preprocess import voxels
 from idam.refine import Refinable
 
-__all__ = ["Agreement", "agreement", "inliers"]
+__all__ = ["Agreement", "agreement", "inliers", "touching"]
 
 Points = NDArray[np.float64]
 
@@ -50,11 +50,30 @@ def agreement(source: Refinable, target: Refinable, transformation: Points, dist
     )
 
 
+def touching(
+    source: Refinable, target: Refinable, transformation: Points, distance: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the source points that a transform (4, 4) lays on the target, and of the target points they lie on.
+
+    A point lies on the nearest one, within ``distance``, where their normals are alike.
+    """
+    rotation = transformation[:3, :3]
+    moved = source.points @ rotation.T + transformation[:3, 3]
+    return _laid_on(moved, source.normals @ rotation.T, target, distance)
+
+
 def _share_on(points: Points, normals: Points, other: Refinable, distance: float) -> float:
+    return len(_laid_on(points, normals, other, distance)[0]) / len(points)
+
+
+def _laid_on(
+    points: Points, normals: Points, other: Refinable, distance: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     found, index = other.search.query(points, distance_upper_bound=distance)
-    near = np.isfinite(found)
+    near = np.flatnonzero(np.isfinite(found))
     cosine = np.abs((normals[near] * other.normals[index[near]]).sum(1))
-    return float((cosine >= SAME_SURFACE).sum() / len(points))
+    near = near[cosine >= SAME_SURFACE]
+    return near, index[near]
 
 
 def inliers(moved: Points, target: Points, distance: float) -> tuple[NDArray[np.int64], float]:

@@ -1,4 +1,4 @@
-"""The search for the answer: propose, refine, score; and once more, harder, where the answer does not look sure."""
+"""The search for the answer: match, agree, refine, score; and again, on finer clouds, where it does not look sure."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from idam.confidence import Evidence, confidence
-from idam.consensus import FeatureMatches, agreeing_transforms, match_features
+from idam.confidence import CLOSE, Evidence, confidence
+from idam.consensus import agreeing_transforms
 from idam.hypotheses import propose, starting_rotations
+from idam.matching import Matching
 from idam.network.model import IDAM
-from idam.pyramid import Pyramid
+from idam.pyramid import Level, Pyramid
 from idam.ranking import Answer, distinct, improve
 from idam.result import Matches
 
@@ -25,13 +26,15 @@ log = logging.getLogger(__name__)
 Points = NDArray[np.float64]
 
 STARTS = 24
-"""Rotations of the source that the network starts from."""
+"""Rotations of the source that the network starts from, where its features change with the pose."""
 HYPOTHESES = 16
 """Different transforms that feature matches agree on that are looked into."""
-CONTENDERS = 8
-"""Answers that stay in the race on the dense clouds."""
+CONTENDERS = 6
+"""Answers that stay in the race on the dense clouds, and on finer ones."""
+FINER = 1.3
+"""Times as many points that the next level must have to be matched as well."""
 SURE = 0.95
-"""Confidence from which no other proposer is asked."""
+"""Confidence from which no finer clouds are matched."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,9 @@ def inverse(transformation: Points) -> Points:
 def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str) -> Found:
     """The answers that explain both clouds best.
 
-    Transforms that many feature matches agree on come first: they cost least. The network, started from many rotations,
-    is asked where they do not settle the matter.
+    Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
+    larger ones are, against which the best answers so far have to stand. A network whose features change with the pose
+    is asked at last, too, from many rotations.
 
     Args:
         clouds: in working coordinates.
@@ -74,23 +78,41 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         seed: of the starting rotations.
         method: of refinement, or ``none``.
     """
-    matches = match_features(clouds.matching.source, clouds.matching.target, clouds.matching.spacing)
-    agreed = distinct(map(Answer, [guess, *agreeing_transforms(matches)]), HYPOTHESES)
-    log.info("%d feature matches, sets of which agree on %d transforms", len(matches.source), len(agreed) - 1)
-    answers = settle(agreed, clouds, matches, 2.0, method)
-    found = examine(answers, matches)
-    if confidence(found.evidence) >= SURE:
+    candidates = [Answer(guess)]
+    for level in distinct_levels(clouds):
+        matching = Matching.of(network, level)
+        agreed = distinct([*candidates, *map(Answer, agreeing_transforms(matching.matches))], HYPOTHESES)
+        answers = settle(agreed, clouds.dense, matching, 2.0, method)
+        found = examine(least_turned(answers, guess), matching)
+        sure = confidence(found.evidence)
+        log.info(
+            "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
+        )
+        if sure >= SURE:
+            return found
+        candidates = answers[:CONTENDERS]
+    if network.features.rotation_invariant:
         return found
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
     learned = distinct(map(Answer, propose(network, clouds.small.source, clouds.small.target, starts)))
     log.info("the network, started from %d rotations, found %d transforms", len(starts), len(learned))
-    return examine(ranked([*answers, *settle(learned, clouds, matches, 4.0, method)]), matches)
+    answers = ranked([*answers, *settle(learned, clouds.dense, matching, 4.0, method)])
+    return examine(least_turned(answers, guess), matching)
 
 
-def settle(answers: list[Answer], clouds: Pyramid, matches: FeatureMatches, reach: float, method: str) -> list[Answer]:
-    """Refine and score answers, on coarse clouds all, within ``reach`` spacings, and on dense ones the best."""
-    answers = ranked(improve(answers, clouds.matching.surfaces, matches, reach, method))
-    answers = ranked(improve(answers[:CONTENDERS], clouds.dense.surfaces, matches, 2.0, method))
+def distinct_levels(clouds: Pyramid) -> list[Level]:
+    """The levels to match features on, the coarsest first; of few points, all are the same."""
+    levels = [clouds.small]
+    for level in (clouds.matching, clouds.dense):
+        if len(level.source) + len(level.target) > FINER * (len(levels[-1].source) + len(levels[-1].target)):
+            levels.append(level)
+    return levels
+
+
+def settle(answers: list[Answer], dense: Level, matching: Matching, reach: float, method: str) -> list[Answer]:
+    """Refine and score answers, all on the matched clouds, within ``reach`` spacings, and the best on dense ones."""
+    answers = ranked(improve(answers, matching.clouds.surfaces, matching, reach, method))
+    answers = ranked(improve(answers[:CONTENDERS], dense.surfaces, matching, 2.0, method))
     log.info("refined and scored: best overlap %.2f, %d others", answers[0].overlap, len(answers) - 1)
     return answers
 
@@ -100,11 +122,21 @@ def ranked(answers: Iterable[Answer]) -> list[Answer]:
     return distinct(sorted(answers, key=lambda answer: -answer.score))
 
 
-def examine(answers: list[Answer], matches: FeatureMatches) -> Found:
+def least_turned(answers: list[Answer], guess: Points) -> list[Answer]:
+    """The answers, first the one nearest to the guess of those that explain the clouds as well as the best.
+
+    Something has to choose among the poses of a symmetric thing, and scans stand upright more often than not.
+    """
+    tied = [answer for answer in answers if answer.score >= (1 - CLOSE) * answers[0].score]
+    first = max(tied, key=lambda answer: float(np.trace(guess[:3, :3].T @ answer.transformation[:3, :3])))
+    return [first, *(answer for answer in answers if answer is not first)]
+
+
+def examine(answers: list[Answer], matching: Matching) -> Found:
     """Look at the best answer more closely: how sure it is, and which matches speak for it."""
-    best, second = answers[0], answers[1].score if len(answers) > 1 else 0.0
-    margin = 1.0 - second / best.score if best.score > 0 else 0.0
-    evidence = Evidence(best.overlap, best.support, margin)
-    weight = matches.weights(best.transformation)
+    best, second = answers[0], max((answer.score for answer in answers[1:]), default=0.0)
+    margin = max(0.0, 1.0 - second / best.score) if best.score > 0 else 0.0
+    evidence = Evidence(best.overlap, best.support, best.likelihood, margin)
+    weight = matching.matches.weights(best.transformation)
     weight /= weight.sum() or 1.0
-    return Found(answers, Matches(*matches.points, weight), evidence)
+    return Found(answers, Matches(*matching.matches.points, weight), evidence)

@@ -8,22 +8,27 @@ it sees in use.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from idam.data.practice import make_practice_pairs
 from idam.data.surfaces import random_room, random_street, random_thing
 from idam.data.visibility import seen_from_afar, seen_from_within
+from idam.errors import InputError
+from idam.io.files import one_line, silenced
 from idam.preprocess import common_frame, without_strays
 from idam.pyramid import level
 
-__all__ = ["Material", "ScanPair", "draw_scans", "load_meshes"]
+__all__ = ["Material", "ScanPair", "draw_halves", "draw_scans", "load_meshes"]
 
 Points = NDArray[np.float64]
 Draw = Callable[["Material", np.random.Generator], "tuple[Points, Points] | None"]
@@ -74,10 +79,28 @@ class ScanPair:
 
 
 def load_meshes(folder: Path) -> list[Any]:
-    """The triangle meshes (``.ply``) of a folder; none where there is no such folder."""
+    """The triangle meshes (``.ply``) of a folder; none where there is no such folder.
+
+    Raises:
+        InputError: one of them cannot be read, or has no surface.
+    """
+    return [_load_mesh(path) for path in sorted(folder.glob("*.ply"))]
+
+
+def _load_mesh(path: Path) -> Any:
     import trimesh
 
-    return [trimesh.load(path, process=False) for path in sorted(folder.glob("*.ply"))]
+    try:
+        with silenced("trimesh"):
+            mesh: Any = trimesh.load(path, process=False)
+            area = float(getattr(mesh, "area", 0.0))
+    except Exception as error:  # there is no telling what parsers throw at a damaged file
+        raise InputError(
+            f"{path}: cannot be read as a mesh ({one_line(error)}); export it again, or remove it"
+        ) from None
+    if not 0 < area < np.inf:
+        raise InputError(f"{path}: is a mesh without area; export it with its faces, or remove it")
+    return mesh
 
 
 def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
@@ -92,8 +115,24 @@ def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
             return pair
 
 
-def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Points]:
-    """Disjoint halves of a shape's points, each cropped by a half-space."""
+def draw_halves(material: Material, rng: np.random.Generator) -> ScanPair:
+    """A pair of the practice protocol (:func:`idam.data.practice.make_practice_pairs`), in any rotation."""
+    shape = torch.from_numpy(material.shapes[rng.integers(len(material.shapes))])[None]
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    pair = make_practice_pairs(shape, generator, math.pi)
+    truth = np.eye(4)
+    truth[:3, :3], truth[:3, 3] = pair.rotation[0].numpy(), pair.translation[0].numpy()
+    scans = _in_working_coordinates(
+        pair.source[0].double().numpy(), pair.target[0].double().numpy(), truth, max(COUNTS)
+    )
+    assert scans is not None  # no voxel grid leaves fewer of so few points
+    return scans
+
+
+def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """Disjoint halves of a shape's points, each cropped by a half-space; None where there are no shapes."""
+    if len(material.shapes) == 0:
+        return None
     points = material.shapes[rng.integers(len(material.shapes))].astype(np.float64)
     points = points[rng.permutation(len(points))]
     first, second = np.array_split(points, 2)
@@ -179,8 +218,12 @@ def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> Sca
         noisy[stray] += 0.3 * rng.normal(size=(stray.sum(), 3))
         clouds.append(noisy)
     source, target = clouds[0], clouds[1] @ truth[:3, :3].T
+    return _in_working_coordinates(source, target, truth, int(rng.choice(COUNTS, p=SHARES)))
+
+
+def _in_working_coordinates(source: Points, target: Points, truth: Points, count: int) -> ScanPair | None:
+    """Clouds and the truth (4, 4) as :func:`idam.register` sees them; None where too few points are left."""
     frame = common_frame(source, target)
-    count = int(rng.choice(COUNTS, p=SHARES))
     scans = level(without_strays(frame.source(source)), without_strays(frame.target(target)), count)
     if min(len(scans.source), len(scans.target)) < FEWEST:
         return None

@@ -85,13 +85,15 @@ def box(count: int, size: Sequence[float] | Points, rng: np.random.Generator) ->
 def cylinder(count: int, radius: float, height: float, rng: np.random.Generator) -> Points:
     """The mantle (count, 3) of an upright cylinder about the origin."""
     angle = rng.uniform(0, 2 * np.pi, count)
-    return np.c_[radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-height / 2, height / 2, count)]
+    mantle: Points = np.c_[radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-height / 2, height / 2, count)]
+    return mantle
 
 
 def stand(points: Points, turn: float, x: float, y: float, z: float) -> Points:
     """Points (N, 3) turned about the vertical, with their lowest at height z above (x, y)."""
-    turned: Points = points @ Rotation.from_euler("z", turn).as_matrix().T
-    return turned + np.array([x, y, z - turned[:, 2].min()])
+    turned = points @ Rotation.from_euler("z", turn).as_matrix().T
+    stood: Points = turned + np.array([x, y, z - turned[:, 2].min()])
+    return stood
 
 
 def random_room(count: int, rng: np.random.Generator, meshes: Sequence[Any] = ()) -> tuple[Points, Points]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-__all__ = ["EqualValidity", "InnerProduct", "RandomSignificance"]
+__all__ = ["EqualValidity", "InnerProduct", "RandomSignificance", "inner_products"]
 
 
 class InnerProduct(nn.Module):
@@ -22,7 +22,7 @@ class InnerProduct(nn.Module):
         self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor
     ) -> tuple[Tensor, Tensor]:
         """No pair features, (B, M, channels) zeros, and the scores (B, M, L); the points play no part."""
-        score = source_features @ target_features.transpose(-1, -2) / source_features.shape[-1] ** 0.5
+        score = inner_products(source_features, target_features)
         return score.new_zeros(*score.shape[:2], self.channels), score
 
 
@@ -33,6 +33,12 @@ class RandomSignificance(nn.Module):
         """Random scores (B, N) of features (B, N, K)."""
         generator = torch.Generator().manual_seed(0)
         return torch.rand(features.shape[:2], generator=generator).to(features)
+
+
+def inner_products(source_features: Tensor, target_features: Tensor) -> Tensor:
+    """Inner products (..., N, P) of features (..., N, K) and (..., P, K), over the root of their size."""
+    scaled: Tensor = source_features @ target_features.transpose(-1, -2) / source_features.shape[-1] ** 0.5
+    return scaled
 
 
 class EqualValidity(nn.Module):

@@ -12,7 +12,7 @@ class Config:
     """What makes one IDAM different from another; the defaults are the paper's.
 
     Attributes:
-        features: ``gnn`` (appendix A) or ``fpfh``.
+        features: ``gnn`` (appendix A), ``fpfh`` or ``invariant``.
         neighbours: K of the GNN's graph.
         normal_radius: radius of FPFH's normals, in the cloud's units.
         feature_radius: radius of FPFH's histograms, in the cloud's units.

@@ -6,6 +6,7 @@ all there is to supervise. A row of the similarity matrix has all of the other s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -16,17 +17,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from idam.data.general import Material, draw_scans, load_meshes
+from idam.data.general import Material, ScanPair, draw_halves, draw_scans, load_meshes
 from idam.data.modelnet40 import load
 from idam.errors import InputError
+from idam.network.ablation import inner_products
 from idam.network.features.invariant import Invariant, Surroundings, surroundings
 from idam.network.model import IDAM
 from idam.network.supervision import negative_entropy_loss
-from idam.training.batches import VALIDATION_SEED
+from idam.training.batches import VALIDATION_SEED, generator_at
 from idam.training.checkpoint import initial_model
 from idam.training.recipe import Recipe
 
-__all__ = ["GeneralStep", "GeneralTask", "MatchLoss", "ScannedPair", "matching_of"]
+__all__ = ["GeneralStep", "GeneralTask", "MatchLoss", "ScannedPair", "learns_features_alone", "matching_of"]
 
 PAIRS = 4800
 """Different pairs to train on: drawn once, and then kept, in some 2 GB."""
@@ -41,6 +43,9 @@ LEAST = -1e4
 """Score of what is left out, where the logarithm of a probability must be a number."""
 ROWS = 200
 """Rows and columns of the similarity matrix, with a match each, that a pair teaches at a step."""
+
+
+Draw = Callable[[Material, np.random.Generator], ScanPair]
 
 
 class MatchLoss(NamedTuple):
@@ -143,7 +148,7 @@ def matching_of(
         return MatchLoss(zero, zero, zero)
     match = match[rows]
     near = (distance[rows] < AMBIGUOUS).scatter_(1, match[:, None], False)
-    score = (own[rows] @ other.t() / own.shape[1] ** 0.5).masked_fill(near, LEAST)
+    score = inner_products(own[rows], other).masked_fill(near, LEAST)
     right = score.detach().argmax(1) == match
     entropy = negative_entropy_loss(significance[rows], score.detach())
     return MatchLoss(F.cross_entropy(score, match), entropy, right.float().mean())
@@ -165,37 +170,61 @@ class GeneralTask:
     The meshes are those in the folder ``meshes`` of the data, where there is one.
     """
 
-    def __init__(self, recipe: Recipe, data: str | Path) -> None:
-        if recipe.config.features != "invariant":
-            raise InputError("training for practice needs features that no pose changes: choose --features invariant")
+    def __init__(self, recipe: Recipe, data: str | Path, precision: str) -> None:
+        check_general(recipe, precision)
         self.recipe = recipe
         shapes, meshes = load(data, "train").points.numpy(), load_meshes(Path(data) / "meshes")
         taught, held = (np.arange(len(shapes)) % HELD != 0), (np.arange(len(shapes)) % HELD == 0)
         self.material = Material(shapes[taught], [mesh for n, mesh in enumerate(meshes) if n % HELD])
         self.module = GeneralStep(initial_model(recipe))
         self.size = PAIRS
-        self.data = f"{PAIRS} pairs of scans: of our own surfaces, ModelNet40's training split and {len(meshes)} meshes"
+        surfaces = f"our own surfaces, ModelNet40's training split and {len(meshes)} meshes"
+        if recipe.experiment != "general":
+            surfaces = "ModelNet40's training split"
+        self.data = f"{PAIRS} pairs of scans of {surfaces}"
         self.held = f"{VALIDATION_PAIRS} pairs of scans, an eighth of the shapes and meshes held out for them"
         kept = Material(shapes[held], meshes[::HELD])
-        self.pairs = [scanned(kept, VALIDATION_SEED, n) for n in range(VALIDATION_PAIRS)]
-        self.pair = cache(lambda n: scanned(self.material, recipe.seed, n))
+        draw = draw_scans if recipe.experiment == "general" else draw_halves
+        self.pairs = [scanned(draw, kept, VALIDATION_SEED, n) for n in range(VALIDATION_PAIRS)]
+        self.pair = cache(lambda n: scanned(draw, self.material, recipe.seed, n))
 
     def batch(self, step: int, rank: int, world: int) -> Lesson:
         """Pairs in an order of their own in each epoch, and what their rows are drawn from."""
         size = self.recipe.batch_size
         epoch, position = divmod(step, PAIRS // size)
-        order = np.random.default_rng((self.recipe.seed, epoch)).permutation(PAIRS)
+        order = np.random.default_rng((unsigned(self.recipe.seed), epoch)).permutation(PAIRS)
         pairs = [self.pair(int(n)) for n in order[position * size : (position + 1) * size][rank::world]]
-        return Lesson(pairs, torch.Generator().manual_seed((self.recipe.seed * 1_000_003 + step) * 4099 + rank))
+        return Lesson(pairs, generator_at(self.recipe, step, rank))
 
     @torch.inference_mode()
     def validate(self) -> tuple[float, MatchScores]:
         """The matching loss, and the accuracy with it."""
         device = next(self.module.parameters()).device
         generator = torch.Generator().manual_seed(VALIDATION_SEED)
+        self.module.eval()  # the running means of the significance's norms are of what is learnt from
         loss = self.module(Lesson([on_device(pair, device) for pair in self.pairs], generator))
+        self.module.train()
         scores = MatchScores(loss.matching.item(), loss.accuracy.item())
         return scores.matching, scores
+
+
+def learns_features_alone(recipe: Recipe) -> bool:
+    """Whether a recipe is for this training: scans in any pose, and features that no pose changes."""
+    halves = recipe.experiment == "practice-any-rotation" and recipe.config.features == "invariant"
+    return recipe.experiment == "general" or halves
+
+
+def check_general(recipe: Recipe, precision: str) -> None:
+    """Raise InputError where a recipe asks for what this training does not teach."""
+    if recipe.config.features != "invariant":
+        raise InputError("training for practice needs features that no pose changes: choose --features invariant")
+    if recipe.config.convolution or recipe.config.hybrid_elimination:
+        raise InputError(
+            "training for practice teaches no convolution and no validity: "
+            "add --set convolution=false --set hybrid_elimination=false"
+        )
+    if precision != "32":
+        raise InputError("training for practice is in single precision: leave --precision out")
 
 
 def on_device(pair: ScannedPair, device: torch.device) -> ScannedPair:
@@ -204,10 +233,15 @@ def on_device(pair: ScannedPair, device: torch.device) -> ScannedPair:
     return ScannedPair(source, target, pair.aligned.to(device), pair.goal.to(device))
 
 
-def scanned(material: Material, seed: int, index: int) -> ScannedPair:
+def scanned(draw: Draw, material: Material, seed: int, index: int) -> ScannedPair:
     """A pair of scans that depends on the seed and its index alone."""
-    pair = draw_scans(material, np.random.default_rng((seed, index)))
+    pair = draw(material, np.random.default_rng((unsigned(seed), index)))
     truth, clouds = pair.transformation, [torch.from_numpy(x).float() for x in (pair.source, pair.target)]
     aligned = torch.from_numpy(pair.source @ truth[:3, :3].T + truth[:3, 3]).float()
     source, target = (compact(surroundings(cloud, pair.spacing)) for cloud in clouds)
     return ScannedPair(source, target, aligned / pair.spacing, clouds[1] / pair.spacing)
+
+
+def unsigned(seed: int) -> int:
+    """A seed of 32 bits as NumPy takes it, which refuses what is negative."""
+    return seed % 2**32

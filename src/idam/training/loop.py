@@ -15,7 +15,7 @@ from idam.io import make_folder
 from idam.memory import keep_freed_memory
 from idam.network.pretrained import save_model
 from idam.training.checkpoint import Progress, history, restore, save_checkpoint
-from idam.training.general import GeneralTask
+from idam.training.general import GeneralTask, learns_features_alone
 from idam.training.log import Log, Parts
 from idam.training.recipe import Recipe, check
 from idam.training.task import PairTask, Task
@@ -67,7 +67,7 @@ def train(
     )
     fabric.launch()
     torch.manual_seed(recipe.seed)
-    task: Task = GeneralTask(recipe, data) if recipe.experiment == "general" else PairTask(recipe, data, precision)
+    task: Task = (GeneralTask if learns_features_alone(recipe) else PairTask)(recipe, data, precision)
     check_batch(recipe.batch_size, task.size, fabric.world_size)
     total = max(1, round(recipe.epochs * (task.size // recipe.batch_size)))
     module = task.module

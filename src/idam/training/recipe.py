@@ -60,8 +60,8 @@ class Recipe:
 
     @property
     def max_angle(self) -> float:
-        """Largest angle of pairs turned in any way: FPFH cannot tell, and GNN features get a near start in use."""
-        return math.pi if self.config.features == "fpfh" else math.radians(75)
+        """Largest angle of pairs turned in any way: only GNN features can tell, and they get a near start in use."""
+        return math.radians(75) if self.config.features == "gnn" else math.pi
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the training, in [0, 1)."""

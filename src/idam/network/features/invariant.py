@@ -101,12 +101,15 @@ class _LargestMessage(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, h: Tensor, weight: Tensor, near: Tensor, pairs: Tensor) -> Tensor:
         largest = torch.addmm(F.embedding(near[0], h), pairs[0], weight.t())
-        which = torch.zeros_like(largest, dtype=torch.uint8)  # of the K
+        learning = any(ctx.needs_input_grad)
+        which = torch.zeros_like(largest, dtype=torch.uint8) if learning else None  # of the K
         for k in range(1, len(near)):
             message = torch.addmm(F.embedding(near[k], h), pairs[k], weight.t())
-            which.masked_fill_(message > largest, k)
+            if which is not None:
+                which.masked_fill_(message > largest, k)
             largest = torch.maximum(largest, message, out=largest)
-        ctx.save_for_backward(which, near, pairs)
+        if learning:
+            ctx.save_for_backward(which, near, pairs)
         return largest
 
     @staticmethod
