@@ -25,13 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["UNREADABLE", "list_models", "load_model", "provenance", "read_weights", "save_model", "save_weights"]
 
 DEFAULT = "general"
-"""The model behind the name ``default``: scans of any kind, in any pose."""
-
-
-UNREADABLE", "list_models", "load_model", "provenance", "read_weights", "save_model", "save_weights"]
-
-DEFAULT = "gnn-gaussian-noise-light"
-"""The model behind the name ``default``: on real scans, noise in training counts for more than exact matches."""
+"""The model behind the name ``default``: for scans of any kind, in any pose."""
 
 
 UNREADABLE = (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError)
