@@ -7,20 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from idam.confidence import CLOSE, SLIGHT, Evidence, confidence, doubt, features
+from idam.confidence import CLOSE, LITTLE, SLIGHT, Evidence, confidence, doubt, features
 
-CLEAR = Evidence(overlap=0.95, support=0.7, margin=0.9)
+CLEAR = Evidence(overlap=0.95, support=0.7, likelihood=3.0, margin=0.9)
 """A clean pair with much overlap."""
-NOTHING = Evidence(overlap=0.0, support=0.0, margin=0.0)
+NOTHING = Evidence(overlap=0.0, support=0.0, likelihood=0.0, margin=0.0)
 GRID = [float(x) for x in np.linspace(0, 1, 6)]
 
 
+def any_evidence(count: int, most: float = 1.0) -> list[Evidence]:
+    shares = np.random.default_rng(0).uniform(0, most, size=(count, 4)).tolist()
+    return [Evidence(overlap, support, 6 * said - 2, margin) for overlap, support, said, margin in shares]
+
+
 def test_confidence_is_a_probability() -> None:
-    for overlap, support, margin in np.random.default_rng(0).uniform(size=(50, 3)):
-        assert 0.0 < confidence(Evidence(overlap, support, margin)) < 1.0
+    for evidence in any_evidence(50):
+        assert 0.0 < confidence(evidence) < 1.0
 
 
-@pytest.mark.parametrize("name", ["overlap", "support", "margin"])
+@pytest.mark.parametrize("name", ["overlap", "support", "likelihood", "margin"])
 @pytest.mark.parametrize("base", [CLEAR, NOTHING])
 def test_confidence_does_not_fall_as_the_evidence_grows(name: str, base: Evidence) -> None:
     grown = [confidence(replace(base, **{name: x})) for x in GRID]
@@ -34,12 +39,13 @@ def test_confident_of_a_clean_pair_and_not_of_nothing() -> None:
 
 @pytest.mark.parametrize("margin", [0.0, 0.5, 1.0])
 def test_not_confident_where_clouds_barely_touch_and_no_match_agrees(margin: float) -> None:
-    assert confidence(Evidence(overlap=0.05, support=0.0, margin=margin)) < 0.5
+    assert confidence(Evidence(overlap=0.05, support=0.0, likelihood=0.0, margin=margin)) < 0.5
 
 
-def test_absurd_evidence_does_not_overflow() -> None:
-    for extreme in (-1e300, 1e300):
-        assert 0.0 <= confidence(replace(CLEAR, overlap=extreme)) <= 1.0
+@pytest.mark.parametrize("name", ["overlap", "likelihood"])
+@pytest.mark.parametrize("extreme", [-1e300, 1e300])
+def test_absurd_evidence_does_not_overflow(name: str, extreme: float) -> None:
+    assert 0.0 <= confidence(replace(CLEAR, **{name: extreme})) <= 1.0
 
 
 def test_first_matches_that_agree_say_more_than_the_last() -> None:
@@ -47,6 +53,15 @@ def test_first_matches_that_agree_say_more_than_the_last() -> None:
     assert supports[0] == 0.0
     assert supports[-1] == 1.0
     assert (np.diff(supports, 2) < 0).all()
+
+
+def test_a_likelihood_below_chance_counts_as_none() -> None:
+    assert [features(replace(CLEAR, likelihood=x))[2] for x in (-2.0, 0.0, 0.5, 4.0)] == [0.0, 0.0, 0.5, 4.0]
+
+
+def test_a_margin_over_answers_that_explain_still_less_says_little() -> None:
+    margins = [features(replace(CLEAR, overlap=x, margin=0.9))[3] for x in (0.0, 0.2, 0.5, 0.9)]
+    assert margins == pytest.approx([0.0, LITTLE * 0.2, LITTLE * 0.5, 0.9])
 
 
 # --- doubt ---------------------------------------------------------------------------------------------------------
@@ -71,8 +86,8 @@ def test_two_poses_are_named_before_little_overlap() -> None:
 
 
 def test_doubt_goes_into_a_sentence() -> None:
-    for overlap, support, margin in np.random.default_rng(0).uniform(0, 0.5, size=(20, 3)):
-        reason = doubt(Evidence(overlap, support, margin))
+    for evidence in any_evidence(20, most=0.5):
+        reason = doubt(evidence)
         assert reason[0].islower()
         assert not reason.endswith(".")
         assert "\n" not in reason

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from idam.errors import InputError
@@ -14,9 +15,11 @@ from idam.pyramid import (
     FINEST,
     MATCHING_POINTS,
     NETWORK_POINTS,
+    SAMPLE,
     Level,
     Pyramid,
     build_pyramid,
+    level as one_level,
 )
 
 
@@ -73,6 +76,28 @@ def test_spacing_is_that_of_the_cloud_with_the_wider(large: Pyramid) -> None:
         assert level.spacing == pytest.approx(expected, rel=1e-6)
     sparse = build_pyramid(shell(900, 1), shell(100, 2), None)
     assert sparse.dense.spacing == pytest.approx(spacing_by_definition(shell(100, 2)))
+
+
+def test_spacing_of_many_points_is_that_of_some_all_over_the_cloud() -> None:
+    # a third of the points lie three times as far apart, and the voxel grid puts them first or last
+    dense, sparse = shell(5000, 1), 3 * shell(2500, 2)
+    for away in (-9.0, 9.0):
+        cloud = np.vstack([dense, sparse + np.array([away, 0, 0])])
+        many = one_level(cloud, cloud, 10_000)
+        assert len(many.source) > 3 * SAMPLE
+        expected = np.median(cKDTree(cloud).query(cloud, k=2)[0][:, 1])
+        assert many.spacing == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("count", [100, 700, 3000])
+def test_a_level_has_about_as_many_points_as_asked_for(count: int) -> None:
+    source, target = shell(9000, 1), 0.7 * shell(9000, 2)
+    found = one_level(source, target, count)
+    assert 0.8 * count <= len(found.source) <= count
+    assert 0.3 * len(found.source) < len(found.target) < 0.7 * len(found.source)
+    other = one_level(target, source, count)
+    np.testing.assert_array_equal(other.target, found.source)
+    assert other.spacing == found.spacing
 
 
 def test_few_points_stay_as_they_are_on_every_level() -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from idam.consensus import FEW, FeatureMatches
-from idam.pyramid import Surfaces
-from idam.ranking import TOUCHING, Answer, alike, distinct, improve
-from idam.refine import Refinable
+from idam.matching import FEW, TOUCHING, Matching
+from idam.pyramid import Level, Surfaces
+from idam.ranking import UNLIKELY, Answer, alike, distinct, improve
 from idam.scoring import agreement
+from matchings import as_matches, matching_by, scores_for
 
 
 def rigid(degrees: float = 0.0, shift: float = 0.0) -> np.ndarray:
@@ -55,6 +54,12 @@ def test_distinct_keeps_the_first_of_those_that_are_alike() -> None:
     assert kept[1].transformation is turned
 
 
+def test_distinct_stops_at_as_many_as_asked_for() -> None:
+    answers = (Answer(rigid(20 * n if n < 4 else pytest.fail("looked further")), 1 - n / 10) for n in range(6))
+    assert [a.overlap for a in distinct(answers, 3)] == pytest.approx([1.0, 0.9, 0.8])
+    assert len(distinct([Answer(rigid(20 * n)) for n in range(3)], 7)) == 3
+
+
 def test_distinct_answers_stay_as_they_are() -> None:
     answers = [Answer(rigid(30 * n), 1 - n / 10) for n in range(6)]
     assert distinct(answers) == answers
@@ -64,66 +69,77 @@ def test_distinct_answers_stay_as_they_are() -> None:
 # --- the score -----------------------------------------------------------------------------------------------------
 
 
-def test_score_grows_with_overlap_and_with_support() -> None:
-    grid = np.linspace(0, 1, 11)
-    for fixed in (0.1, 0.5, 1.0):
-        by_overlap = [Answer(rigid(), overlap=x, support=fixed).score for x in grid]
-        by_support = [Answer(rigid(), overlap=fixed, support=x).score for x in grid]
+def test_score_grows_with_likelihood_and_with_overlap() -> None:
+    for fixed in (0.0, 0.5, 1.0):
+        by_likelihood = [Answer(rigid(), overlap=fixed, likelihood=x).score for x in np.linspace(0, 4, 11)]
+        by_overlap = [Answer(rigid(), overlap=x, likelihood=4 * fixed).score for x in np.linspace(0, 1, 11)]
+        assert by_likelihood == sorted(set(by_likelihood))
         assert by_overlap == sorted(set(by_overlap))
-        assert by_support == sorted(set(by_support))
 
 
-def test_score_is_nothing_without_overlap_and_something_without_support() -> None:
-    assert Answer(rigid(), overlap=0.0, support=1.0).score == 0.0
-    assert Answer(rigid(), overlap=0.5, support=0.0).score > 0.0
+def test_features_that_speak_against_an_answer_count_as_saying_nothing() -> None:
+    against, silent = (Answer(rigid(), overlap=0.8, likelihood=x).score for x in (-2.0, 0.0))
+    assert against == silent == pytest.approx(UNLIKELY * 0.8)
     assert Answer(rigid()).score == 0.0
 
 
-def test_few_matches_make_wrong_contact_rank_below_less_of_the_right() -> None:
-    assert Answer(rigid(), overlap=0.7, support=0.0).score < Answer(rigid(), overlap=0.4, support=0.3).score
-    # but matches do not make up for surfaces that lie apart
-    assert Answer(rigid(), overlap=0.1, support=0.5).score < Answer(rigid(), overlap=0.7, support=0.0).score
+def test_wrong_contact_ranks_below_less_overlap_of_points_that_are_alike() -> None:
+    assert Answer(rigid(), overlap=0.9, likelihood=0.02).score < Answer(rigid(), overlap=0.2, likelihood=0.2).score
+    # and between answers of which the features say nothing, overlap decides
+    assert Answer(rigid(), overlap=0.2, likelihood=-0.1).score < Answer(rigid(), overlap=0.4, likelihood=-0.5).score
+
+
+def test_support_is_for_the_confidence_alone() -> None:
+    assert Answer(rigid(), 0.5, support=0.0, likelihood=1.0).score == Answer(rigid(), 0.5, 1.0, 1.0).score
 
 
 # --- improving -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def surfaces() -> Surfaces:
-    """Two samplings of three unlike boxes in one pose."""
+def boxes(count: int, seed: int) -> np.ndarray:
+    """Points on three unlike boxes."""
     corners = [([0, 0, 0], [1, 0.6, 0.2]), ([0, 0, 0.2], [0.2, 0.6, 0.8]), ([0.6, 0.1, 0.2], [0.9, 0.3, 0.5])]
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in corners])
-    clouds = [np.asarray(trimesh.sample.sample_surface(mesh, 800, seed=seed)[0]) - 0.3 for seed in (1, 2)]
-    return Surfaces(*map(Refinable.build, clouds), spacing=0.03)
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0]) - 0.3
 
 
 @pytest.fixture(scope="module")
-def matches() -> FeatureMatches:
-    """Two of three are right under the identity."""
-    points = torch.as_tensor(np.random.default_rng(0).normal(size=(30, 3)), dtype=torch.float32)
-    return FeatureMatches(points, points + torch.tensor([0.0, 0.0, 0.0, 0.0, 5.0, 5.0]).repeat(5)[:, None], 0.045)
+def surfaces() -> Surfaces:
+    """Two samplings of one thing in one pose."""
+    return Level(boxes(800, seed=1), boxes(800, seed=2), 0.03).surfaces
+
+
+@pytest.fixture(scope="module")
+def matching() -> Matching:
+    """What coarser clouds say: of their matches two of three are right under the identity, and so are the scores."""
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    wrong = np.array([0.0, 0.0, 0.0, 0.0, 5.0, 5.0]).repeat(5)[:, None]
+    clouds = Level(boxes(300, seed=3), boxes(250, seed=4), 0.05)
+    return matching_by(clouds, scores_for(clouds, rigid()), as_matches(points, points + wrong, 0.045))
 
 
 STARTS = [rigid(170), rigid(6, 0.05), rigid(), rigid(60, 0.3)]
 
 
-def test_improve_without_refinement_only_scores(surfaces: Surfaces, matches: FeatureMatches) -> None:
-    found = improve([Answer(start, overlap=7.0) for start in STARTS], surfaces, matches, 4.0, "none")
+def test_improve_without_refinement_only_scores(surfaces: Surfaces, matching: Matching) -> None:
+    found = improve([Answer(start, overlap=7.0) for start in STARTS], surfaces, matching, 4.0, "none")
     assert len(found) == len(STARTS)
     for a, start in zip(found, STARTS, strict=True):
         assert (a.transformation == start).all()
-        assert a.support == matches.support(start)
+        assert a.support == matching.matches.support(start)
+        assert a.likelihood == matching.likelihood(start)
         expected = agreement(surfaces.source, surfaces.target, start, TOUCHING * surfaces.spacing)
         assert a.overlap == expected.score
     assert max(found, key=lambda a: a.score) is found[2]
     assert found[2].support == pytest.approx(20 / (30 + FEW))
 
 
-def test_improve_refines_each_and_scores_what_it_refined(surfaces: Surfaces, matches: FeatureMatches) -> None:
-    unrefined, refined = (improve(list(map(Answer, STARTS)), surfaces, matches, 4.0, m) for m in ("none", "gicp"))
+def test_improve_refines_each_and_scores_what_it_refined(surfaces: Surfaces, matching: Matching) -> None:
+    unrefined, refined = (improve(list(map(Answer, STARTS)), surfaces, matching, 4.0, m) for m in ("none", "gicp"))
     assert len(refined) == len(STARTS)
     assert refined[1].overlap > 0.7 > 0.5 > unrefined[1].overlap
     assert refined[1].support == pytest.approx(20 / (30 + FEW))
+    assert refined[1].likelihood > unrefined[1].likelihood + 0.3
     # the truth itself, and the one that started near it
     for a in refined[1:3]:
         assert np.degrees(Rotation.from_matrix(a.transformation[:3, :3]).magnitude()) < 1.0
@@ -132,11 +148,11 @@ def test_improve_refines_each_and_scores_what_it_refined(surfaces: Surfaces, mat
     assert not alike(refined[-1].transformation, np.eye(4))
 
 
-def test_refinement_reaches_only_so_far(surfaces: Surfaces, matches: FeatureMatches) -> None:
+def test_refinement_reaches_only_so_far(surfaces: Surfaces, matching: Matching) -> None:
     start = Answer(rigid(6, 0.05))
-    near, far = (improve([start], surfaces, matches, reach, "gicp")[0].overlap for reach in (0.3, 4.0))
+    near, far = (improve([start], surfaces, matching, reach, "gicp")[0].overlap for reach in (0.3, 4.0))
     assert near < 0.6 < 0.7 < far
 
 
-def test_nothing_to_improve(surfaces: Surfaces, matches: FeatureMatches) -> None:
-    assert improve([], surfaces, matches, 4.0, "gicp") == []
+def test_nothing_to_improve(surfaces: Surfaces, matching: Matching) -> None:
+    assert improve([], surfaces, matching, 4.0, "gicp") == []

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from idam.refine import Refinable
-from idam.scoring import SAME_SURFACE, Agreement, agreement, inliers
+from idam.scoring import SAME_SURFACE, Agreement, agreement, inliers, touching
 
 DISTANCE = 0.1
 
@@ -138,6 +138,51 @@ def test_takes_the_normals_that_refinement_estimates(transformation: np.ndarray,
     upright = transformation.copy()
     upright[:3, :3] = transformation[:3, :3] @ Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix()
     assert agreement(Refinable.build(plane), target, upright, 0.2).score < 0.05
+
+
+# --- points that touch ---------------------------------------------------------------------------------------------
+
+
+def laid_on_one_by_one(source: Surface, target: Surface, transformation: np.ndarray) -> list[tuple[int, int]]:
+    there = moved(source, transformation)
+    pairs = []
+    for i, (point, normal) in enumerate(zip(there.points, there.normals, strict=True)):
+        distance = [float(np.linalg.norm(point - other)) for other in target.points]
+        j = int(np.argmin(distance))
+        if distance[j] < DISTANCE and abs(normal @ target.normals[j]) >= SAME_SURFACE:
+            pairs.append((i, j))
+    return pairs
+
+
+def test_points_that_touch_are_those_found_one_by_one(
+    sphere: Surface, transformation: np.ndarray, random: np.random.Generator
+) -> None:
+    source = part(sphere, slice(0, 350))
+    target = moved(part(sphere, slice(200, 500)), transformation)
+    target = Surface(target.points + random.normal(scale=0.04, size=(300, 3)), target.normals)
+    target.normals[:50] = np.cross(target.normals[:50], [0.6, 0.0, 0.8])
+    for matrix in (transformation, transformation @ np.diag([-1.0, -1.0, 1.0, 1.0])):
+        rows, columns = touching(source, target, matrix, DISTANCE)
+        assert rows.dtype == columns.dtype == np.int64
+        pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+        assert pairs == laid_on_one_by_one(source, target, matrix)
+        assert 20 < len(pairs) < 330
+        assert len(pairs) / 350 == agreement(source, target, matrix, DISTANCE).source_share
+
+
+def test_points_of_identical_clouds_touch_themselves(sphere: Surface, transformation: np.ndarray) -> None:
+    order = np.random.default_rng(1).permutation(500)
+    there = moved(sphere, transformation)
+    rows, columns = touching(sphere, Surface(there.points[order], there.normals[order]), transformation, DISTANCE)
+    np.testing.assert_array_equal(rows, np.arange(500))
+    np.testing.assert_array_equal(order[columns], rows)
+
+
+def test_nothing_of_disjoint_clouds_touches(sphere: Surface) -> None:
+    away = np.eye(4)
+    away[0, 3] = 5.0
+    rows, columns = touching(sphere, sphere, away, DISTANCE)
+    assert rows.shape == columns.shape == (0,)
 
 
 # --- inliers -------------------------------------------------------------------------------------------------------

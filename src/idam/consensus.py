@@ -21,25 +21,25 @@ __all__ = ["agreeing_transforms"]
 
 Points = NDArray[np.float64]
 
-SEEDS = 200
-"""Matches from which a set of agreeing ones is grown."""
 COMPANIONS = 20
 """Matches that a seed's first transform is solved from, besides itself."""
-ROUNDS = 5
+ROUNDS = 3
 """Times a seed's transform is solved anew, from the matches that it brings together."""
 
 
 @torch.inference_mode()
-def agreeing_transforms(matches: FeatureMatches) -> list[Points]:
+def agreeing_transforms(matches: FeatureMatches, seeds: int) -> list[Points]:
     """Transforms (4, 4) that sets of matches agree on, the largest set first; many are alike.
 
-    None where there are fewer than three matches.
+    Args:
+        matches: of which some are right; where there are fewer than three, they agree on nothing.
+        seeds: matches, the most compatible ones, from each of which a set of agreeing ones is grown.
     """
     source, target, tolerance = matches.source, matches.target, matches.tolerance
     if len(source) < 3:
         return []
     second_order = _second_order_compatibility(source, target, tolerance)
-    seed = second_order.sum(1).sort(descending=True, stable=True).indices[:SEEDS]
+    seed = second_order.sum(1).sort(descending=True, stable=True).indices[:seeds]
     weight, companion = second_order[seed].topk(min(COMPANIONS, len(source)), 1)
     index = torch.cat([seed[:, None], companion], 1)
     # the seed itself is compatible with whatever its best companion is

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from idam.network.ablation import inner_products
-from idam.network.features.invariant import Invariant, surroundings
+from idam.network.features.invariant import Invariant, Surroundings, surroundings
 from idam.network.model import IDAM
 from idam.pyramid import Level
 from idam.scoring import touching
@@ -88,7 +88,7 @@ class Matching:
         points = [torch.as_tensor(cloud, dtype=torch.float32) for cloud in (clouds.source, clouds.target)]
         source, target = (surroundings(cloud, clouds.spacing) for cloud in points)
         if isinstance(network.features, Invariant):
-            score = inner_products(network.features.describe(source), network.features.describe(target))
+            score = inner_products(described(network.features, source), described(network.features, target))
         else:
             score = torch.cdist(source.histograms, target.histograms, compute_mode="donot_use_mm_for_euclid_dist")
             score /= -BLUR
@@ -110,6 +110,12 @@ class Matching:
         by_row = score - self.row[rows] + np.log(self.score.shape[1])
         by_column = score - self.column[columns] + np.log(self.score.shape[0])
         return float(torch.minimum(by_row, by_column).clamp(AGAINST, FOR).sum() / min(self.score.shape))
+
+
+def described(features: Invariant, around: Surroundings) -> Tensor:
+    """Features (N, K), on the CPU, of a cloud there; worked out where the network is."""
+    device = features.length.device
+    return features.describe(Surroundings(*(x.to(device) for x in around))).cpu()
 
 
 def mutual_matches(score: Tensor, row: Tensor, column: Tensor) -> Tensor:

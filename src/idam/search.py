@@ -1,4 +1,4 @@
-"""The search for the answer: match, agree, refine, score; and again, on finer clouds, where it does not look sure."""
+"""The search for the answer: match, agree, refine, score; and again, on larger clouds, where it is not sure."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ Points = NDArray[np.float64]
 
 STARTS = 24
 """Rotations of the source that the network starts from, where its features change with the pose."""
-HYPOTHESES = 16
-"""Different transforms that feature matches agree on that are looked into."""
+SEEDS = 200, 1000
+"""Matches that sets of agreeing ones are grown from, on the small clouds and on the larger ones."""
+HYPOTHESES = 16, 64
+"""Different transforms among those that the sets agree on that are looked into, likewise."""
 CONTENDERS = 6
-"""Answers that stay in the race on the dense clouds, and on finer ones."""
-FINER = 1.3
-"""Times as many points that the next level must have to be matched as well."""
+"""Answers that stay in the race on the dense clouds, and against what larger ones say."""
 SURE = 0.95
-"""Confidence from which no finer clouds are matched."""
+"""Confidence from which no larger clouds are matched."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     """The answers that explain both clouds best.
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
-    larger ones are, against which the best answers so far have to stand. A network whose features change with the pose
-    is asked at last, too, from many rotations.
+    larger ones are, and looked into more closely; the best answers so far have to stand against what they say. At
+    last, a network whose features change with the pose is asked, too, from many rotations.
 
     Args:
         clouds: in working coordinates.
@@ -79,10 +79,11 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         method: of refinement, or ``none``.
     """
     candidates = [Answer(guess)]
-    for level in distinct_levels(clouds):
+    for level, seeds, hypotheses in zip((clouds.small, clouds.matching), SEEDS, HYPOTHESES, strict=True):
         matching = Matching.of(network, level)
-        agreed = distinct([*candidates, *map(Answer, agreeing_transforms(matching.matches))], HYPOTHESES)
-        answers = settle(agreed, clouds.dense, matching, 2.0, method)
+        agreed = map(Answer, agreeing_transforms(matching.matches, seeds))
+        candidates = distinct([*candidates, *agreed], hypotheses)
+        answers = settle(candidates, clouds.dense, matching, 2.0, method)
         found = examine(least_turned(answers, guess), matching)
         sure = confidence(found.evidence)
         log.info(
@@ -98,15 +99,6 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     log.info("the network, started from %d rotations, found %d transforms", len(starts), len(learned))
     answers = ranked([*answers, *settle(learned, clouds.dense, matching, 4.0, method)])
     return examine(least_turned(answers, guess), matching)
-
-
-def distinct_levels(clouds: Pyramid) -> list[Level]:
-    """The levels to match features on, the coarsest first; of few points, all are the same."""
-    levels = [clouds.small]
-    for level in (clouds.matching, clouds.dense):
-        if len(level.source) + len(level.target) > FINER * (len(levels[-1].source) + len(levels[-1].target)):
-            levels.append(level)
-    return levels
 
 
 def settle(answers: list[Answer], dense: Level, matching: Matching, reach: float, method: str) -> list[Answer]:
