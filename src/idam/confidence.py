@@ -38,14 +38,13 @@ class Evidence:
     margin: float
 
 
-def features(evidence: Evidence) -> tuple[float, float, float, float]:
+def features(evidence: Evidence) -> tuple[float, float, float]:
     """What the logistic function is linear in.
 
     The first few matches that agree say more than the last; and an answer that explains little is not made sure by
     others that explain still less.
     """
-    margin = min(evidence.margin, LITTLE * evidence.overlap)
-    return evidence.overlap, math.sqrt(evidence.support), max(0.0, evidence.likelihood), margin
+    return evidence.overlap, math.sqrt(max(0.0, evidence.likelihood)), min(evidence.margin, LITTLE * evidence.overlap)
 
 
 def confidence(evidence: Evidence) -> float:
