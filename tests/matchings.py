@@ -16,8 +16,8 @@ NO_MATCHES = FeatureMatches(torch.empty(0, 3), torch.empty(0, 3), TOLERANCE)
 
 
 def as_matches(source: np.ndarray, target: np.ndarray, tolerance: float = TOLERANCE) -> FeatureMatches:
-    ends = (torch.as_tensor(points, dtype=torch.float32) for points in (source, target))
-    return FeatureMatches(*ends, tolerance)
+    first, second = (torch.as_tensor(points, dtype=torch.float32) for points in (source, target))
+    return FeatureMatches(first, second, tolerance)
 
 
 def example(*right: tuple[np.ndarray, int], wrong: int, seed: int = 0) -> FeatureMatches:
@@ -53,4 +53,5 @@ def bumpy(count: int, seed: int) -> np.ndarray:
     points = np.random.default_rng(seed).normal(size=(count, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     waves = np.sin(5 * points @ np.array([0.6, 0.0, 0.8])) + np.cos(4 * points @ np.array([0.0, 1.0, 0.3]))
-    return points * [1.0, 0.6, 0.4] * (0.8 + 0.15 * waves[:, None]) + 0.2 * np.maximum(points, 0)
+    bumps: np.ndarray = points * [1.0, 0.6, 0.4] * (0.8 + 0.15 * waves[:, None]) + 0.2 * np.maximum(points, 0)
+    return bumps

@@ -434,6 +434,9 @@ def test_models_lists_every_model_with_its_provenance(
         history = provenance(name)
         assert history["experiment"] in words
         assert " ".join(history["command"].split()) in words
+        scores = history["validation"]
+        told = ("accuracy", "accuracy") if "accuracy" in scores else ("RMSE(R)", "rmse_r")
+        assert f"{told[0]} {scores[told[1]]:.3f}" in words
 
 
 def test_version(call: Call) -> None:

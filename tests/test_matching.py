@@ -91,7 +91,7 @@ def as_set(pairs: Tensor) -> set[tuple[int, ...]]:
 def mutual_by_definition(score: Tensor, *, ties: bool) -> set[tuple[int, ...]]:
     """Pairs with fewer than so many better on either side; of those that tie for the last place all, or none."""
     table = score.numpy()
-    pairs = set()
+    pairs: set[tuple[int, ...]] = set()
     for i, j in np.ndindex(*table.shape):
         others = np.delete(table[i], j), np.delete(table[:, j], i)
         before = [(x > table[i, j]) if ties else (x >= table[i, j]) for x in others]
@@ -155,6 +155,7 @@ def test_no_more_matches_than_fit_and_those_the_likeliest(
 
 def test_scores_are_inner_products_of_features_that_no_pose_changes(clouds: Level) -> None:
     network = IDAM(INVARIANT)
+    assert isinstance(network.features, Invariant)
     features = [
         network.features.describe(surroundings(torch.as_tensor(cloud, dtype=torch.float32), clouds.spacing)).double()
         for cloud in (clouds.source, clouds.target)
@@ -249,7 +250,7 @@ def said_by_definition(clouds: Level, score: np.ndarray, transformation: np.ndar
                 math.log(math.exp(score[i, j]) / np.exp(alike).mean()) for alike in (score[i], score[:, j])
             )
             total += min(max(min(by_row, by_column), AGAINST), FOR)
-    return total / min(score.shape)
+    return float(total / min(score.shape))
 
 
 @pytest.mark.parametrize("transformation", [TRUTH, TRUTH @ rigid([0.5, 0.0, 0.0], [0.0, 0.0, 0.0]), OTHER])
@@ -329,7 +330,7 @@ def test_likelihood_swaps_where_the_points_lie_one_on_one(name: str) -> None:
 
 
 def test_features_are_described_where_the_network_is(clouds: Level, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = set()
+    seen: set[str] = set()
 
     def describe(_: Invariant, around: Surroundings) -> Tensor:
         seen.update(x.device.type for x in around)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from idam import pyramid
 from idam.errors import InputError
 from idam.preprocess import MIN_POINTS
 from idam.pyramid import (
@@ -19,7 +20,6 @@ from idam.pyramid import (
     Level,
     Pyramid,
     build_pyramid,
-    level as one_level,
 )
 
 
@@ -83,7 +83,7 @@ def test_spacing_of_many_points_is_that_of_some_all_over_the_cloud() -> None:
     dense, sparse = shell(5000, 1), 3 * shell(2500, 2)
     for away in (-9.0, 9.0):
         cloud = np.vstack([dense, sparse + np.array([away, 0, 0])])
-        many = one_level(cloud, cloud, 10_000)
+        many = pyramid.level(cloud, cloud, 10_000)
         assert len(many.source) > 3 * SAMPLE
         expected = np.median(cKDTree(cloud).query(cloud, k=2)[0][:, 1])
         assert many.spacing == pytest.approx(expected, rel=0.05)
@@ -92,10 +92,10 @@ def test_spacing_of_many_points_is_that_of_some_all_over_the_cloud() -> None:
 @pytest.mark.parametrize("count", [100, 700, 3000])
 def test_a_level_has_about_as_many_points_as_asked_for(count: int) -> None:
     source, target = shell(9000, 1), 0.7 * shell(9000, 2)
-    found = one_level(source, target, count)
+    found = pyramid.level(source, target, count)
     assert 0.8 * count <= len(found.source) <= count
     assert 0.3 * len(found.source) < len(found.target) < 0.7 * len(found.source)
-    other = one_level(target, source, count)
+    other = pyramid.level(target, source, count)
     np.testing.assert_array_equal(other.target, found.source)
     assert other.spacing == found.spacing
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from idam import search as searching
 from idam.confidence import CONVERGED, Evidence, confidence, doubt
 from idam.errors import InputError
 from idam.io import PointCloud, write_point_cloud
+from idam.matching import FOR
 from idam.network.pretrained import find
 from idam.preprocess import common_frame
 from idam.pyramid import Level
@@ -132,7 +133,9 @@ def test_figures_are_those_of_brute_force(result: RegistrationResult) -> None:
 
 def test_other_fields(result: RegistrationResult) -> None:
     assert result.confidence == confidence(result.evidence)
-    assert all(0.0 <= evidence <= 1.0 for evidence in astuple(result.evidence))
+    evidence = result.evidence
+    assert all(0.0 < share <= 1.0 for share in (evidence.overlap, evidence.support, evidence.margin))
+    assert 0.5 < evidence.likelihood <= FOR
     assert result.model == "default"
     assert 0.0 < result.seconds < 60.0
     assert result.information.shape == (6, 6)
@@ -171,7 +174,9 @@ def test_runners_up_are_other_transforms_that_score_less(result: RegistrationRes
         assert np.linalg.norm(move(other.transformation, CENTRE) - TARGET.mean(0)) < 1.5
 
 
-@pytest.mark.parametrize("evidence", [Evidence(0.9, 0.8, 3.0, 0.9), Evidence(0.1, 0.01, 0.1, 0.01), Evidence(0.0, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "evidence", [Evidence(0.9, 0.8, 3.0, 0.9), Evidence(0.1, 0.01, 0.1, 0.01), Evidence(0.0, 0.0, 0.0, 0.0)]
+)
 def test_reason_is_given_where_the_answer_is_not_to_count_on(
     evidence: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,15 +215,23 @@ def threads() -> Iterator[Callable[[int], None]]:
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("target", [move(TRUTH, SOURCE[40:]), noise(120, seed=1)], ids=["easy", "hard"])
+@pytest.mark.parametrize(
+    ("source", "target", "model"),
+    [(SOURCE, move(TRUTH, SOURCE[40:]), "default"), (SOURCE[:150], noise(120, seed=1), "gnn-unseen-shapes")],
+    ids=["easy", "hard"],
+)
 def test_any_number_of_threads_same_bits(
-    target: np.ndarray, threads: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+    source: np.ndarray,
+    target: np.ndarray,
+    model: str,
+    threads: Callable[[int], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(searching, "STARTS", 4)
     found = []
     for count in (1, 2):
         threads(count)
-        found.append(idam.register(SOURCE[:150] if len(target) < 150 else SOURCE, target))
+        found.append(idam.register(source, target, model=model))
     one, two = found
     np.testing.assert_array_equal(one.transformation, two.transformation)
     np.testing.assert_array_equal(one.matches.weight, two.matches.weight)
@@ -288,7 +301,7 @@ def test_place_does_not_matter(result: RegistrationResult, source_at: np.ndarray
     found = idam.register(SOURCE + source_at, TARGET + target_at)
     assert degrees(found.transformation, result.transformation) < SETTLED
     shift = found.apply(SOURCE + source_at) - (result.apply(SOURCE) + target_at)
-    assert np.abs(shift).max() < 1e-3
+    assert np.abs(shift).max() < SETTLED / 100
     # millimetres in a national grid: the product of a rotation and 5.6e6 must not lose them
     np.testing.assert_allclose(
         found.transformation[:3, :3] @ found.transformation[:3, :3].T, np.eye(3), rtol=0, atol=1e-12
@@ -457,8 +470,7 @@ def test_no_refinement(result: RegistrationResult) -> None:
     with_none, with_word = (idam.register(SOURCE, TARGET, refine=refine) for refine in (None, "none"))
     np.testing.assert_array_equal(with_none.transformation, with_word.transformation)
     np.testing.assert_array_equal(with_none.information, np.zeros((6, 6)))
-    assert with_none.fitness <= result.fitness
-    assert (with_none.transformation != result.transformation).any()
+    assert degrees(result.transformation, TRUTH) < degrees(with_none.transformation, TRUTH) < 10.0
     rotation = with_none.transformation[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 

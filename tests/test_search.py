@@ -1,4 +1,4 @@
-"""The search for the answer: what it asks, and what it makes of it."""
+"""The search for the answer: what it matches, whom it asks, and what it makes of it."""
 
 from __future__ import annotations
 
@@ -8,22 +8,41 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from idam import search as searching
-from idam.confidence import CONVERGED, confidence
-from idam.consensus import FeatureMatches
+from idam.confidence import CLOSE, CONVERGED, Evidence, confidence
+from idam.matching import Matching
+from idam.network.config import Config
 from idam.network.model import IDAM, KeyPoints
 from idam.network.pretrained import load_model
-from idam.pyramid import Pyramid, build_pyramid
+from idam.pyramid import Level, Pyramid, build_pyramid, level
 from idam.ranking import Answer, alike
 from idam.result import Matches
-from idam.search import HYPOTHESES, STARTS, Found, examine, inverse, ranked, search, settle
+from idam.search import (
+    CONTENDERS,
+    HYPOTHESES,
+    SEEDS,
+    STARTS,
+    SURE,
+    Found,
+    examine,
+    inverse,
+    least_turned,
+    ranked,
+    search,
+    settle,
+)
+from matchings import as_matches, matching_by, scores_for
 from motions import move, rigid
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.02, -0.01, 0.03])
 FAR = rigid([0.4, 0.2, -0.1], [9.0, 0.0, 0.0])
 """Where the clouds do not even touch."""
+WRONG = TRUTH @ rigid([0.0, 0.0, 1.5], [0.1, 0.0, 0.0])
+"""Where they touch, but in the wrong places."""
+INVARIANT = Config(features="invariant", convolution=False, hybrid_elimination=False, iterations=1, blocks=1)
 
 
 def part(count: int, seed: int) -> np.ndarray:
@@ -84,18 +103,147 @@ def found(easy: Pyramid) -> Found:
     return search(easy, Silent().eval(), np.eye(4), 0, "gicp")
 
 
+@pytest.fixture(scope="module")
+def steps() -> Pyramid:
+    """Two samplings of one thing, few enough points to be quick, in levels that differ."""
+    source, target = part(3000, seed=1), move(TRUTH, part(3000, seed=2))
+    return Pyramid(*(level(source, target, count) for count in (150, 300, 500, 700)))
+
+
+@pytest.fixture
+def matched(monkeypatch: pytest.MonkeyPatch) -> list[Level]:
+    """The clouds that are matched, in turn."""
+    clouds: list[Level] = []
+    of = Matching.of
+
+    def noted(network: IDAM, level: Level) -> Matching:
+        clouds.append(level)
+        return of(network, level)
+
+    monkeypatch.setattr(Matching, "of", noted)
+    return clouds
+
+
+@pytest.fixture
+def speechless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Features say nothing: all points are alike, and none match."""
+    monkeypatch.setattr(Matching, "of", lambda _, clouds: unspeaking(clouds))
+
+
+def unspeaking(clouds: Level) -> Matching:
+    return matching_by(clouds, torch.zeros(len(clouds.source), len(clouds.target)))
+
+
+def same(levels: list[Level], expected: list[Level]) -> bool:
+    return [*map(id, levels)] == [*map(id, expected)]
+
+
+# --- what it matches -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("network", [Config(), INVARIANT], ids=["FPFH", "invariant"])
+def test_an_easy_pair_settles_on_small_clouds_without_the_network(
+    easy: Pyramid, matched: list[Level], network: Config
+) -> None:
+    found = search(easy, Silent(network).eval(), np.eye(4), 0, "gicp")
+    np.testing.assert_allclose(found.answers[0].transformation, TRUTH, atol=0.01)
+    assert confidence(found.evidence) >= SURE
+    assert same(matched, [easy.small])
+
+
+@pytest.mark.parametrize(
+    ("confidences", "rounds"), [([0.96, 0.0], 1), ([SURE, 0.0], 1), ([SURE - 1e-6, 0.0], 2), ([0.1, 0.99], 2)]
+)
+def test_stops_where_it_is_sure_and_goes_on_to_larger_clouds_where_not(
+    steps: Pyramid,
+    matched: list[Level],
+    monkeypatch: pytest.MonkeyPatch,
+    confidences: list[float],
+    rounds: int,
+) -> None:
+    said = iter(confidences)
+    monkeypatch.setattr(searching, "confidence", lambda _: next(said))
+    found = search(steps, Silent(INVARIANT).eval(), np.eye(4), 0, "none")
+    assert same(matched, [steps.small, steps.matching][:rounds])
+    # what it returns is what the last of them say
+    assert cdist(found.matches.source, matched[-1].source).min(1).max() < 1e-6
+
+
+def test_answers_have_to_stand_against_what_larger_clouds_say(
+    steps: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = matching_by(steps.small, scores_for(steps.small, WRONG))
+    larger = matching_by(steps.matching, scores_for(steps.matching, TRUTH))
+    agreed = iter([[WRONG, TRUTH], []])
+    monkeypatch.setattr(Matching, "of", lambda _, clouds: small if clouds is steps.small else larger)
+    monkeypatch.setattr(searching, "agreeing_transforms", lambda *_: next(agreed))
+    monkeypatch.setattr(searching, "propose", lambda *_: [FAR])
+    monkeypatch.setattr(searching, "SURE", 2.0)
+    found = search(steps, silent, FAR, 0, "none")
+    np.testing.assert_array_equal(found.answers[0].transformation, TRUTH)
+    np.testing.assert_array_equal(found.answers[1].transformation, WRONG)
+    assert small.likelihood(WRONG) > small.likelihood(TRUTH)
+    for answer in found.answers:
+        assert answer.likelihood == larger.likelihood(answer.transformation)
+
+
+def test_larger_clouds_are_looked_into_more_closely(
+    steps: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch, speechless: None
+) -> None:
+    turns = [rigid([0.0, 0.0, 0.2 * n], [0.0, 0.0, 0.3 * m]) for n in range(31) for m in range(5)]
+    asked, looked_into = [], []
+
+    def agreeing(_: object, seeds: int) -> list[np.ndarray]:
+        asked.append(seeds)
+        return turns
+
+    def improve(answers: list[Answer], *_: object) -> list[Answer]:
+        looked_into.append(len(answers))
+        return answers
+
+    monkeypatch.setattr(searching, "agreeing_transforms", agreeing)
+    monkeypatch.setattr(searching, "improve", improve)
+    search(steps, Silent(INVARIANT).eval(), FAR, 0, "gicp")
+    assert asked == list(SEEDS)
+    assert looked_into == [HYPOTHESES[0], CONTENDERS, HYPOTHESES[1], CONTENDERS]
+    assert SEEDS[0] < SEEDS[1] and HYPOTHESES[0] < HYPOTHESES[1]
+
+
 # --- whom it asks --------------------------------------------------------------------------------------------------
 
 
-def test_an_easy_pair_settles_without_the_network(found: Found) -> None:
-    np.testing.assert_allclose(found.answers[0].transformation, TRUTH, atol=0.01)
-    assert confidence(found.evidence) > 0.95
-
-
-def test_an_unrelated_pair_asks_the_network_and_is_not_counted_on(unrelated: Pyramid, asked: Asked) -> None:
+def test_an_unrelated_pair_asks_a_network_whose_features_turn_and_is_not_counted_on(
+    unrelated: Pyramid, asked: Asked
+) -> None:
     found = search(unrelated, asked, np.eye(4), 0, "gicp")
     assert asked.clouds
     assert confidence(found.evidence) < CONVERGED
+
+
+@pytest.mark.parametrize("config", [INVARIANT, Config(features="fpfh")], ids=["invariant", "FPFH"])
+def test_a_network_of_features_that_no_pose_changes_is_never_started_from_rotations(
+    easy: Pyramid, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searching, "SURE", 2.0)
+    monkeypatch.setattr(searching, "propose", lambda *_: pytest.fail("the network was asked"))
+    found = search(easy, Silent(config).eval(), np.eye(4), 0, "gicp")
+    np.testing.assert_allclose(found.answers[0].transformation, TRUTH, atol=0.01)
+
+
+def test_a_network_is_asked_last(
+    steps: Pyramid, silent: IDAM, matched: list[Level], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searching, "SURE", 2.0)
+    before: list[Level] = []
+
+    def propose(*_: object) -> list[np.ndarray]:
+        before.extend(matched)
+        return [FAR]
+
+    monkeypatch.setattr(searching, "propose", propose)
+    search(steps, silent, np.eye(4), 0, "none")
+    assert same(before, [steps.small, steps.matching])
+    assert same(matched, before)
 
 
 def test_network_sees_the_small_clouds_from_many_rotations(
@@ -116,13 +264,9 @@ def test_network_starts_turn_around_the_guess(easy: Pyramid, asked: Asked, monke
     np.testing.assert_allclose(source[0], easy.small.source @ FAR[:3, :3].T, atol=1e-6)
 
 
-NONE = FeatureMatches(torch.empty(0, 3), torch.empty(0, 3), 0.1)
-
-
 def test_what_the_network_knows_wins_where_features_say_nothing(
-    easy: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch
+    easy: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch, speechless: None
 ) -> None:
-    monkeypatch.setattr(searching, "match_features", lambda *_: NONE)
     near = rigid([0.03, 0.0, -0.02], [0.01, 0.0, 0.0]) @ TRUTH
     monkeypatch.setattr(searching, "propose", lambda *_: [np.eye(4), near, FAR])
     monkeypatch.setattr(searching, "SURE", 2.0)
@@ -133,9 +277,8 @@ def test_what_the_network_knows_wins_where_features_say_nothing(
 
 
 def test_without_matches_or_network_the_guess_is_refined(
-    easy: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch
+    easy: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch, speechless: None
 ) -> None:
-    monkeypatch.setattr(searching, "match_features", lambda *_: NONE)
     monkeypatch.setattr(searching, "SURE", 0.0)
     guess = rigid([0.03, 0.0, -0.02], [0.01, 0.0, 0.0]) @ TRUTH
     (answer,) = search(easy, silent, guess, 0, "gicp").answers
@@ -154,8 +297,10 @@ def test_a_guess_far_off_does_no_harm(easy: Pyramid, silent: IDAM, found: Found)
     np.testing.assert_allclose(other.answers[0].transformation, found.answers[0].transformation, atol=1e-3)
 
 
-def test_search_is_the_same_bits_every_time(unrelated: Pyramid) -> None:
-    network = load_model()
+@pytest.mark.parametrize("name", ["default", "gnn-unseen-shapes"])
+def test_search_is_the_same_bits_every_time(unrelated: Pyramid, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(searching, "STARTS", 4)
+    network = load_model(name)
     once, again = (search(unrelated, network, np.eye(4), 3, "gicp") for _ in range(2))
     np.testing.assert_array_equal(
         [answer.transformation for answer in once.answers], [answer.transformation for answer in again.answers]
@@ -169,7 +314,7 @@ def test_search_is_the_same_bits_every_time(unrelated: Pyramid) -> None:
 def test_answers_are_unlike_each_other_the_best_first(found: Found) -> None:
     scores = [answer.score for answer in found.answers]
     assert scores == sorted(scores, reverse=True)
-    assert 1 <= len(scores) <= HYPOTHESES
+    assert 1 <= len(scores) <= CONTENDERS
     for n, answer in enumerate(found.answers):
         assert not any(alike(answer.transformation, other.transformation) for other in found.answers[:n])
 
@@ -185,24 +330,54 @@ def test_ties_stay_in_order() -> None:
     assert ranked(answers) == answers
 
 
-def test_settle_refines_and_scores_on_the_dense_clouds(easy: Pyramid) -> None:
+def turned(degrees: float, **figures: float) -> Answer:
+    return Answer(rigid([0.0, 0.0, np.radians(degrees)], [0.0, 0.0, 0.0]), **figures)
+
+
+def test_of_answers_as_good_as_the_best_the_one_nearest_to_the_guess_comes_first() -> None:
+    best, turn, slight = turned(180, likelihood=1.0), turned(90, likelihood=0.98), turned(20, likelihood=0.95)
+    worse = turned(0, likelihood=0.99 - CLOSE)
+    assert least_turned([best, turn, slight, worse], np.eye(4)) == [slight, best, turn, worse]
+    about = turned(100).transformation
+    assert least_turned([best, turn, slight, worse], about) == [turn, best, slight, worse]
+    assert least_turned([best], np.eye(4)) == [best]
+    assert least_turned([best, worse], np.eye(4)) == [best, worse]
+
+
+def test_a_symmetric_thing_is_turned_no_more_than_it_must_be(silent: IDAM) -> None:
+    box = trimesh.creation.box((1.2, 0.8, 0.5))
+    turn = rigid([0.0, 0.3, 0.2], [0.05, 0.0, 0.0])
+    source, target = (np.asarray(trimesh.sample.sample_surface(box, 6000, seed=seed)[0]) for seed in (1, 2))
+    clouds = Pyramid(*(level(source, move(turn, target), count) for count in (400, 500, 1000, 1000)))
+    for half_turn in (np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])):
+        network = Silent(INVARIANT).eval()
+        network.load_state_dict(load_model("general").state_dict())
+        found = search(clouds, network, half_turn, 0, "gicp")
+        np.testing.assert_allclose(found.answers[0].transformation, turn @ half_turn, atol=0.05)
+        assert found.evidence.margin < CLOSE
+
+
+def test_settle_refines_and_scores_on_the_dense_clouds(steps: Pyramid) -> None:
     near = rigid([0.03, 0.0, -0.02], [0.01, 0.0, 0.0]) @ TRUTH
-    best, *others = settle([Answer(FAR), Answer(np.eye(4)), Answer(near)], easy, NONE, 2.0, "gicp")
-    np.testing.assert_allclose(best.transformation, TRUTH, atol=0.01)
+    matching = matching_by(steps.small, scores_for(steps.small, TRUTH))
+    best, *others = settle([Answer(FAR), Answer(np.eye(4)), Answer(near)], steps.dense, matching, 2.0, "gicp")
+    np.testing.assert_allclose(best.transformation, TRUTH, atol=0.02)
     assert best.overlap > 0.9
+    assert best.likelihood == matching.likelihood(best.transformation) > 1.0
     assert all(other.overlap < best.overlap for other in others)
 
 
-def matches_of(easy: Pyramid, right: int, wrong: int) -> FeatureMatches:
-    source = torch.as_tensor(easy.small.source[: right + wrong], dtype=torch.float32)
-    target = torch.as_tensor(move(TRUTH, source.double().numpy()), dtype=torch.float32)
+def matching_of(easy: Pyramid, right: int, wrong: int) -> Matching:
+    """Of the matches some are right under the truth."""
+    source = easy.small.source[: right + wrong]
+    target = move(TRUTH, source)
     target[right:] += 5.0
-    return FeatureMatches(source, target, 0.05)
+    return replace(unspeaking(easy.small), matches=as_matches(source, target, 0.05))
 
 
 @pytest.mark.parametrize(("right", "total"), [(30, 1.0), (0, 0.0)])
 def test_weights_of_the_matches_sum_to_one_or_are_all_nothing(easy: Pyramid, right: int, total: float) -> None:
-    found = examine([Answer(TRUTH, 0.9, right / 40)], matches_of(easy, right, 40 - right))
+    found = examine([Answer(TRUTH, 0.9, right / 40)], matching_of(easy, right, 40 - right))
     assert found.matches.weight.shape == (40,)
     assert found.matches.weight.sum() == pytest.approx(total)
     assert (found.matches.weight[:right] > 0).all()
@@ -210,25 +385,26 @@ def test_weights_of_the_matches_sum_to_one_or_are_all_nothing(easy: Pyramid, rig
     assert found.matches.source.dtype == found.matches.target.dtype == np.float64
 
 
-def test_margin_of_the_only_answer_is_whole(easy: Pyramid) -> None:
-    matches = matches_of(easy, 20, 20)
-    only = Answer(TRUTH, 0.9, 0.5)
-    evidence = examine([only], matches).evidence
-    assert (evidence.overlap, evidence.support, evidence.margin) == (0.9, 0.5, 1.0)
-    assert examine([only, Answer(FAR)], matches).evidence.margin == 1.0
+def test_evidence_is_that_of_the_first_answer_and_the_margin_of_the_only_one_is_whole(easy: Pyramid) -> None:
+    matching = matching_of(easy, 20, 20)
+    only = Answer(TRUTH, overlap=0.9, support=0.5, likelihood=2.5)
+    assert examine([only], matching).evidence == Evidence(overlap=0.9, support=0.5, likelihood=2.5, margin=1.0)
+    assert examine([only, Answer(FAR)], matching).evidence.margin == 1.0
 
 
-def test_margin_is_how_much_less_the_second_scores_as_a_share(easy: Pyramid) -> None:
-    matches = matches_of(easy, 20, 20)
-    best = Answer(TRUTH, 0.8, 0.5)
-    answers = [best, Answer(FAR, 0.2, 0.5), Answer(np.eye(4), 0.1, 0.5)]
-    assert examine(answers, matches).evidence.margin == pytest.approx(0.75)
-    assert examine([best, replace(best, transformation=FAR)], matches).evidence.margin == 0.0
+def test_margin_is_how_much_less_the_next_best_scores_as_a_share(easy: Pyramid) -> None:
+    matching = matching_of(easy, 20, 20)
+    best, second, third = (Answer(rigid([x, 0, 0], [0, 0, 0]), likelihood=x) for x in (2.0, 0.5, 0.3))
+    assert examine([best, second, third], matching).evidence.margin == pytest.approx(0.75)
+    assert examine([best, third, second], matching).evidence.margin == pytest.approx(0.75)
+    assert examine([best, replace(best, transformation=FAR)], matching).evidence.margin == 0.0
+    # first because it turns least, though another is a little better
+    assert examine([second, best], matching).evidence.margin == 0.0
 
 
 def test_margin_is_nothing_where_nothing_touches(easy: Pyramid) -> None:
-    assert examine([Answer(FAR)], NONE).evidence.margin == 0.0
-    assert examine([Answer(FAR), Answer(np.eye(4))], NONE).evidence.margin == 0.0
+    for answers in ([Answer(FAR)], [Answer(FAR), Answer(np.eye(4))]):
+        assert examine(answers, unspeaking(easy.small)).evidence.margin == 0.0
 
 
 # --- the other way round -------------------------------------------------------------------------------------------
@@ -246,6 +422,7 @@ def test_inverted_exchanges_source_and_target(found: Found) -> None:
     for answer, other in zip(back.answers, found.answers, strict=True):
         np.testing.assert_allclose(answer.transformation, np.linalg.inv(other.transformation), atol=1e-12)
         assert (answer.overlap, answer.support) == (other.overlap, other.support)
+        assert answer.likelihood == other.likelihood
     assert back.matches.source is found.matches.target
     assert back.matches.target is found.matches.source
     assert back.matches.weight is found.matches.weight
