@@ -73,8 +73,8 @@ def test_a_margin_over_answers_that_explain_still_less_says_little() -> None:
     [
         (replace(CLEAR, margin=0.9 * CLOSE), "two poses explain the data equally well"),
         (replace(CLEAR, overlap=0.9 * SLIGHT), "overlap about 22 %"),
-        (replace(CLEAR, support=0.0), "few of the feature matches agree with the answer"),
-        (replace(CLEAR, margin=CLOSE, overlap=SLIGHT), "few of the feature matches agree with the answer"),
+        (replace(CLEAR, likelihood=0.0), "the surfaces that it lays together are little alike"),
+        (replace(CLEAR, margin=CLOSE, overlap=SLIGHT), "the surfaces that it lays together are little alike"),
     ],
 )
 def test_doubt_names_what_is_wrong(evidence: Evidence, reason: str) -> None:

@@ -256,7 +256,7 @@ def test_best_runners_up_are_named(tmp_path: Path) -> None:
     turned = make_pair()[2].transformation @ np.diag([-1.0, -1, 1, 1])
     others = [Hypothesis(turned, score=0.4 - 0.01 * n) for n in range(RUNNERS_UP + 2)]
     page = write(tmp_path / "page.html", *make_pair(hypotheses=others))
-    assert "<th>Answer 2, 180.0° away from this one</th><td>agreement 0.40</td>" in page
+    assert "<th>Answer 2, 180.0° away from this one</th><td>score 0.40</td>" in page
     assert page.count("away from this one") == RUNNERS_UP
 
 

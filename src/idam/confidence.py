@@ -41,8 +41,8 @@ class Evidence:
 def features(evidence: Evidence) -> tuple[float, float, float]:
     """What the logistic function is linear in.
 
-    The first few matches that agree say more than the last; and an answer that explains little is not made sure by
-    others that explain still less.
+    The first bit of likelihood says more than the last; and an answer that explains little is not made sure by others
+    that explain still less.
     """
     return evidence.overlap, math.sqrt(max(0.0, evidence.likelihood)), min(evidence.margin, LITTLE * evidence.overlap)
 
@@ -60,7 +60,7 @@ def doubt(evidence: Evidence) -> str:
         return "two poses explain the data equally well"
     if evidence.overlap < SLIGHT:
         return f"overlap about {100 * evidence.overlap:.0f} %"
-    return "few of the feature matches agree with the answer"
+    return "the surfaces that it lays together are little alike"
 
 
 @lru_cache(1)

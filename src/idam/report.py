@@ -43,6 +43,7 @@ _EVIDENCE = {
     "overlap": "Agreement of the clouds where they lie on each other, 0 to 1",
     "margin": "How much less the next best answer scores, as a share",
     "support": "Share of the feature matches that the answer brings together",
+    "likelihood": "How much likelier the features make the answer than chance, 0 and less to 4",
 }
 """What the fields of :class:`idam.confidence.Evidence` are called on the page."""
 
@@ -143,7 +144,7 @@ def _evidence(result: RegistrationResult) -> _Rows:
     rows = [(_EVIDENCE.get(name, name), _number(value, 2)) for name, value in asdict(result.evidence).items()]
     for place, other in enumerate(result.hypotheses[:RUNNERS_UP], start=2):
         turn = _degrees(result.transformation[:3, :3].T @ other.transformation[:3, :3])
-        rows.append((f"Answer {place}, {turn} away from this one", f"agreement {_number(other.score, 2)}"))
+        rows.append((f"Answer {place}, {turn} away from this one", f"score {_number(other.score, 2)}"))
     return rows
 
 

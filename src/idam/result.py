@@ -35,7 +35,8 @@ class Hypothesis:
 
     Attributes:
         transformation: (4, 4), source to target coordinates, not refined on all points.
-        score: what it was ranked by (:attr:`idam.ranking.Answer.score`); the answer's is higher.
+        score: what it was ranked by (:attr:`idam.ranking.Answer.score`); the answer's is higher, or nearly as high and
+            the answer is turned less.
     """
 
     transformation: NDArray[np.float64]

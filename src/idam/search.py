@@ -33,7 +33,7 @@ HYPOTHESES = 16, 64
 """Different transforms among those that the sets agree on that are looked into, likewise."""
 CONTENDERS = 6
 """Answers that stay in the race on the dense clouds, and against what larger ones say."""
-SURE = 0.95
+SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
 
@@ -42,7 +42,7 @@ class Found:
     """What the search found, in working coordinates.
 
     Attributes:
-        answers: the best first, and those that are not like it.
+        answers: the one to give first, and then those that are not like it, the best first.
         matches: of features, weighted by how well the best answer brings them together.
         evidence: what speaks for the best answer.
     """
@@ -91,7 +91,7 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         )
         if sure >= SURE:
             return found
-        candidates = answers[:CONTENDERS]
+        candidates = answers
     if network.features.rotation_invariant:
         return found
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
