@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 from idam.network.ablation import inner_products
 from idam.network.features.invariant import Invariant, Surroundings, surroundings
 from idam.network.model import IDAM
+from idam.network.pretrained import load_model
 from idam.pyramid import Level
 from idam.scoring import touching
 
@@ -20,8 +22,6 @@ __all__ = ["FeatureMatches", "Matching", "mutual_matches"]
 
 Points = NDArray[np.float64]
 
-BLUR = 5.0
-"""Distance of FPFH histograms that makes one match likelier than another by a factor of e."""
 RANK = 2
 """Two points match where each is among the other's so many best."""
 MATCHES = 1000
@@ -84,14 +84,10 @@ class Matching:
     @classmethod
     @torch.inference_mode()
     def of(cls, network: IDAM, clouds: Level) -> Matching:
-        """By a network's features, or by FPFH where its own change with the pose."""
+        """By a network's features, or by the default model's where it is of the paper's kind."""
+        features = network.features if isinstance(network.features, Invariant) else default_features()
         points = [torch.as_tensor(cloud, dtype=torch.float32) for cloud in (clouds.source, clouds.target)]
-        source, target = (surroundings(cloud, clouds.spacing) for cloud in points)
-        if isinstance(network.features, Invariant):
-            score = inner_products(described(network.features, source), described(network.features, target))
-        else:
-            score = torch.cdist(source.histograms, target.histograms, compute_mode="donot_use_mm_for_euclid_dist")
-            score /= -BLUR
+        score = inner_products(*(described(features, surroundings(cloud, clouds.spacing)) for cloud in points))
         row, column = score.logsumexp(1), score.logsumexp(0)
         pairs = mutual_matches(score, row, column)
         matches = FeatureMatches(points[0][pairs[:, 0]], points[1][pairs[:, 1]], TOLERANCE * clouds.spacing)
@@ -110,6 +106,12 @@ class Matching:
         by_row = score - self.row[rows] + np.log(self.score.shape[1])
         by_column = score - self.column[columns] + np.log(self.score.shape[0])
         return float(torch.minimum(by_row, by_column).clamp(AGAINST, FOR).sum() / min(self.score.shape))
+
+
+@lru_cache(1)
+def default_features() -> Invariant:
+    """Those of the default model, on the CPU."""
+    return cast(Invariant, load_model().features)
 
 
 def described(features: Invariant, around: Surroundings) -> Tensor:

@@ -14,6 +14,7 @@ from idam.confidence import CLOSE, Evidence, confidence
 from idam.consensus import agreeing_transforms
 from idam.hypotheses import propose, starting_rotations
 from idam.matching import Matching
+from idam.network.features.invariant import Invariant
 from idam.network.model import IDAM
 from idam.pyramid import Level, Pyramid
 from idam.ranking import Answer, distinct, improve
@@ -26,7 +27,7 @@ log = logging.getLogger(__name__)
 Points = NDArray[np.float64]
 
 STARTS = 24
-"""Rotations of the source that the network starts from, where its features change with the pose."""
+"""Rotations of the source that a network of the paper's kind starts from."""
 SEEDS = 200, 1000
 """Matches that sets of agreeing ones are grown from, on the small clouds and on the larger ones."""
 HYPOTHESES = 16, 64
@@ -69,7 +70,7 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
     larger ones are, and looked into more closely; the best answers so far have to stand against what they say. At
-    last, a network whose features change with the pose is asked, too, from many rotations.
+    last a network of the paper's kind, whose matches depend on the pose, is asked from many rotations.
 
     Args:
         clouds: in working coordinates.
@@ -92,7 +93,7 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         if sure >= SURE:
             return found
         candidates = answers
-    if network.features.rotation_invariant:
+    if isinstance(network.features, Invariant):
         return found
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
     learned = distinct(map(Answer, propose(network, clouds.small.source, clouds.small.target, starts)))
