@@ -367,7 +367,7 @@ def matches(randn) -> Matches:
     return Matches("range hood", *randn(2, 40, 3), *randn(2, 9, 3), torch.arange(9) < 5)
 
 
-MANY_TIMES = {f"network gnn-gaussian-noise-light {n}": {1024: 10.0 + n, 4096: 90.0 + n} for n in range(22)}
+MANY_TIMES = {f"network gnn-gaussian-noise {n}": {1024: 10.0 + n, 4096: 90.0 + n} for n in range(22)}
 
 FIGURES = {
     "one registration": lambda randn: draw_overlays(overlays(randn, 1, "left\nto right"), 1),
@@ -441,7 +441,7 @@ def test_all_figures_are_written(shapes, scans, write, tmp_path):
         tmp_path,
         scans=scans,
         speed=write({"threads": 2, "median_ms": TIMES}),
-        model="gnn-gaussian-noise-light",
+        model="gnn-gaussian-noise",
         progress=told.append,
     )
     assert told == ["registrations", "iterations", "validity", "keypoints", "correspondences", "scans", "speed"]
