@@ -23,6 +23,7 @@ from idam.network.config import Config
 from idam.network.features.invariant import surroundings
 from idam.network.pretrained import load_model, provenance
 from idam.training import Recipe, general, loop, train
+from idam.training.batches import VALIDATION_SEED
 from idam.training.general import (
     AMBIGUOUS,
     MATCHED,
@@ -33,6 +34,7 @@ from idam.training.general import (
     ScannedPair,
     compact,
     expanded,
+    learns_features_alone,
     matching_of,
     scanned,
 )
@@ -202,11 +204,12 @@ def test_perfect_features_match_all_and_lose_nothing(generator):
 # pairs and batches
 
 
-def test_a_pair_s_clouds_overlap_under_the_truth(make):
+@pytest.mark.parametrize("draw", [scans.draw_scans, scans.draw_halves])
+def test_a_pair_s_clouds_overlap_under_the_truth(make, draw):
     material = make().material
     for n in range(4):
-        pair = scans.draw_scans(material, np.random.default_rng((3, n)))
-        found = scanned(material, 3, n)
+        pair = draw(material, np.random.default_rng((3, n)))
+        found = scanned(draw, material, 3, n)
         distance = torch.cdist(found.aligned.double(), found.goal.double())
         shares = [(distance.amin(way) < scans.TOUCHING).double().mean() for way in (0, 1)]
         assert min(shares).item() == pytest.approx(pair.overlap, abs=1e-9)
@@ -258,7 +261,7 @@ def test_an_eighth_of_shapes_and_meshes_is_held_out(small, shapes, tmp_path, mon
     for n in range(9):
         trimesh.creation.box((n + 1, 1, 1)).export(tmp_path / "meshes" / f"{n}.ply")
     asked = []
-    monkeypatch.setattr(general, "scanned", lambda material, *_: asked.append(material))
+    monkeypatch.setattr(general, "scanned", lambda _, material, *__: asked.append(material))
     task = GeneralTask(SMALL, tmp_path, "32")
     task.batch(0, 0, 1)
     held, taught = asked[0], asked[-1]
@@ -268,6 +271,29 @@ def test_an_eighth_of_shapes_and_meshes_is_held_out(small, shapes, tmp_path, mon
     assert sorted(mesh.extents[0] for mesh in held.meshes) == [1, 9]
     assert sorted(mesh.extents[0] for mesh in taught.meshes) == list(range(2, 9))
     assert "9 meshes" in task.data
+
+
+def test_validation_pairs_are_none_that_training_draws_whatever_its_seed(small, shapes, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(general, "scanned", lambda *state: drawn.append(state[2:]))
+    task = GeneralTask(changed(seed=VALIDATION_SEED), tmp_path, "32")
+    held = set(drawn)
+    for step in range(task.size // SMALL.batch_size):
+        task.batch(step, 0, 1)
+    assert len(held) == general.VALIDATION_PAIRS
+    assert held.isdisjoint(drawn[len(held) :])
+
+
+def test_halves_are_drawn_where_they_are_what_is_trained_for(small, shapes, tmp_path, monkeypatch):
+    drawn = set()
+    monkeypatch.setattr(general, "scanned", lambda draw, *_: drawn.add(draw))
+    for experiment, draw in (("general", scans.draw_scans), ("practice-any-rotation", scans.draw_halves)):
+        drawn.clear()
+        recipe = changed(experiment=experiment)
+        assert learns_features_alone(recipe)
+        GeneralTask(recipe, tmp_path, "32").batch(0, 0, 1)
+        assert drawn == {draw}
+    assert not learns_features_alone(changed(experiment="practice-any-rotation", config=Config()))
 
 
 # training

@@ -185,7 +185,8 @@ class GeneralTask:
         self.held = f"{VALIDATION_PAIRS} pairs of scans, an eighth of the shapes and meshes held out for them"
         kept = Material(shapes[held], meshes[::HELD])
         draw = draw_scans if recipe.experiment == "general" else draw_halves
-        self.pairs = [scanned(draw, kept, VALIDATION_SEED, n) for n in range(VALIDATION_PAIRS)]
+        # of indices that no training reaches, whatever its seed
+        self.pairs = [scanned(draw, kept, VALIDATION_SEED, PAIRS + n) for n in range(VALIDATION_PAIRS)]
         self.pair = cache(lambda n: scanned(draw, self.material, recipe.seed, n))
 
     def batch(self, step: int, rank: int, world: int) -> Lesson:

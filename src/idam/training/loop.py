@@ -131,7 +131,7 @@ def check_batch(batch_size: int, shapes: int, processes: int) -> None:
     """Raise InputError where there are too few shapes for a batch, or too few pairs in one for all processes."""
     if batch_size > shapes:
         raise InputError(
-            f"{shapes} shapes to train on do not fill a batch of {batch_size}: choose a smaller --batch-size"
+            f"{shapes} shapes or pairs to train on do not fill a batch of {batch_size}: choose a smaller --batch-size"
         )
     if batch_size < processes:
         raise InputError(f"{processes} processes cannot share a batch of {batch_size}: choose a larger --batch-size")
