@@ -42,6 +42,7 @@ SMALL = Recipe(
     learning_rate=3e-3,
     keep=1 / 3,
 )
+SHIPPED = "gnn-unseen-shapes"
 STEPS = 9
 """Of SMALL: 36 of the 40 shapes are trained on, 4 a step."""
 
@@ -483,9 +484,9 @@ def test_a_start_is_where_the_weights_come_from(fit, started, shapes, tmp_path):
 
 
 def test_a_shipped_model_can_be_gone_on_from_with_more_iterations(fit, tmp_path):
-    recipe = changed(config=Config(iterations=4), start="default", epochs=1 / STEPS, learning_rate=1e-9, keep=1 / 6)
+    recipe = changed(config=Config(iterations=4), start=SHIPPED, epochs=1 / STEPS, learning_rate=1e-9, keep=1 / 6)
     fit(recipe, tmp_path)
-    shipped, trained = load_model("default"), load_model(tmp_path / "best.safetensors")
+    shipped, trained = load_model(SHIPPED), load_model(tmp_path / "best.safetensors")
     assert trained.config.iterations == 4
     for one, other in zip(shipped.parameters(), trained.parameters(), strict=True):
         assert torch.allclose(one, other, atol=1e-6)
