@@ -35,8 +35,8 @@ medians of one pair at a time on a busy machine: compare those under Efficiency,
 - A name that ends in `-paper` is the network with the paper's inference (3 iterations, N/6 points, no further tries).
 - One that ends in `-tuned` is a rival with settings chosen on validation pairs, beside the published ones.
 - `pointnetlk`, `dcp` and `prnet` are our implementations, trained for 12 minutes of one core for each table (753 to
-  928, 88 to 114 and 66 to 73 steps of 8 pairs), where their authors trained for hours on a GPU: read them as a beginning,
-  not as those methods' worth. PRNet with noise had 26 minutes, since other work took half of its core.
+  928, 88 to 114 and 66 to 73 steps of 8 pairs), where their authors trained for hours on a GPU: read them as a
+  beginning, not as those methods' worth. PRNet with noise had 26 minutes, since other work took half of its core.
 - `register` is the whole of `idam.register`, with the default model unless another is named. A fifth of what that
   learnt from are halves of ModelNet40's training shapes, of all categories: to it, the unseen categories are not new.
   It knows of no limit to the rotation, and may find a symmetric shape's other pose.
