@@ -43,7 +43,7 @@ _EVIDENCE = {
     "overlap": "Agreement of the clouds where they lie on each other, 0 to 1",
     "margin": "How much less the next best answer scores, as a share",
     "support": "Share of the feature matches that the answer brings together",
-    "likelihood": "How much likelier the features make the answer than chance, 0 and less to 4",
+    "likelihood": "How much likelier the features make the answer than chance, as a logarithm",
 }
 """What the fields of :class:`idam.confidence.Evidence` are called on the page."""
 
