@@ -6,8 +6,7 @@ import sys
 from collections.abc import Callable
 from itertools import count, pairwise
 from pathlib import Path
-from types import SimpleNamespace
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
