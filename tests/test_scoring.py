@@ -69,12 +69,17 @@ def test_disjoint_clouds_do_not_agree(sphere: Surface) -> None:
     assert agreement(sphere, sphere, away, DISTANCE).score == 0.0
 
 
+def overlapping(sphere: Surface, transformation: np.ndarray, random: np.random.Generator) -> tuple[Surface, Surface]:
+    """Two parts of a sphere that share 150 points, the second moved and noisy."""
+    target = moved(part(sphere, slice(200, 500)), transformation)
+    noisy = target.points + random.normal(scale=0.04, size=(300, 3))
+    return part(sphere, slice(0, 350)), Surface(noisy, target.normals)
+
+
 def test_swapping_the_clouds_swaps_the_shares(
     sphere: Surface, transformation: np.ndarray, random: np.random.Generator
 ) -> None:
-    source = part(sphere, slice(0, 350))
-    target = moved(part(sphere, slice(200, 500)), transformation)
-    target = Surface(target.points + random.normal(scale=0.04, size=(300, 3)), target.normals)
+    source, target = overlapping(sphere, transformation, random)
     there = agreement(source, target, transformation, DISTANCE)
     back = agreement(target, source, np.linalg.inv(transformation), DISTANCE)
     assert (there.source_share, there.target_share) == (back.target_share, back.source_share)
@@ -85,9 +90,7 @@ def test_swapping_the_clouds_swaps_the_shares(
 def test_shares_are_those_of_brute_force(
     sphere: Surface, transformation: np.ndarray, random: np.random.Generator
 ) -> None:
-    source = part(sphere, slice(0, 350))
-    target = moved(part(sphere, slice(200, 500)), transformation)
-    target = Surface(target.points + random.normal(scale=0.04, size=(300, 3)), target.normals)
+    source, target = overlapping(sphere, transformation, random)
     there = moved(source, transformation)
     distance = cdist(there.points, target.points)
     alike = np.abs(there.normals @ target.normals.T) >= SAME_SURFACE
@@ -157,9 +160,7 @@ def laid_on_one_by_one(source: Surface, target: Surface, transformation: np.ndar
 def test_points_that_touch_are_those_found_one_by_one(
     sphere: Surface, transformation: np.ndarray, random: np.random.Generator
 ) -> None:
-    source = part(sphere, slice(0, 350))
-    target = moved(part(sphere, slice(200, 500)), transformation)
-    target = Surface(target.points + random.normal(scale=0.04, size=(300, 3)), target.normals)
+    source, target = overlapping(sphere, transformation, random)
     target.normals[:50] = np.cross(target.normals[:50], [0.6, 0.0, 0.8])
     for matrix in (transformation, transformation @ np.diag([-1.0, -1.0, 1.0, 1.0])):
         rows, columns = touching(source, target, matrix, DISTANCE)

@@ -33,6 +33,7 @@ from idam.training.batches import Batch, batch_at, split_validation
 from idam.training.checkpoint import initial_model
 from idam.training.step import SupervisedStep
 from idam.training.task import validate
+from watching import watched_log
 
 SMALL = Recipe(
     config=Config(neighbours=6, channels=8),
@@ -72,17 +73,9 @@ def fit(monkeypatch: pytest.MonkeyPatch, shapes: Shapes) -> Callable[..., list[L
     monkeypatch.setattr(protocol, "CROPPED_POINTS", 96)
 
     def run(recipe: Recipe, output: Path, *, stop_after: int | None = None, **options: Any) -> list[Loss]:
-        losses = []
-
-        class WatchedLog(loop.Log):
-            def step(self, step: int, loss: Loss) -> None:
-                super().step(step, loss)
-                losses.append(Loss(*(part.detach() for part in loss)))
-                if step == stop_after:
-                    raise KeyboardInterrupt
-
+        losses: list[Loss] = []
         with monkeypatch.context() as patch:
-            patch.setattr(loop, "Log", WatchedLog)
+            patch.setattr(loop, "Log", watched_log(losses, stop_after))
             best = train(recipe, "not read", output, **({"device": "cpu"} | options))
         assert best == output / "best.safetensors"
         return losses

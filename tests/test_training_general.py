@@ -38,6 +38,7 @@ from idam.training.general import (
     matching_of,
     scanned,
 )
+from watching import watched_log
 
 CONFIG = Config(features="invariant", convolution=False, hybrid_elimination=False, iterations=1, blocks=1, channels=8)
 SMALL = Recipe("general", CONFIG, epochs=1, batch_size=3, schedule="one-cycle", learning_rate=3e-3)
@@ -83,17 +84,9 @@ def fit(small, monkeypatch) -> Callable[..., list[MatchLoss]]:
     monkeypatch.setattr(loop, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
 
     def run(recipe: Recipe, output: Path, *, stop_after: int | None = None, **options: Any) -> list[MatchLoss]:
-        losses = []
-
-        class WatchedLog(loop.Log):
-            def step(self, step: int, loss: MatchLoss) -> None:
-                super().step(step, loss)
-                losses.append(MatchLoss(*(part.detach() for part in loss)))
-                if step == stop_after:
-                    raise KeyboardInterrupt
-
+        losses: list[MatchLoss] = []
         with monkeypatch.context() as patch:
-            patch.setattr(loop, "Log", WatchedLog)
+            patch.setattr(loop, "Log", watched_log(losses, stop_after))
             train(recipe, output.parent, output, **({"device": "cpu"} | options))
         return losses
 
