@@ -13,7 +13,7 @@ from idam.errors import InputError
 from idam.preprocess import MIN_POINTS, choose_voxel_size, downsample
 from idam.refine import Refinable
 
-__all__ = ["Level", "Pyramid", "Surfaces", "build_pyramid", "level"]
+__all__ = ["Level", "Pyramid", "Surfaces", "build_pyramid", "level", "spacing_of"]
 
 Points = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> P
         voxel_size = max(voxel_size, FINEST)
         few = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
         _check_number(*few)
-        small = matching = Level(few[0], few[1], max(map(_spacing, few)))
+        small = matching = Level(few[0], few[1], max(map(spacing_of, few)))
     return Pyramid(small, matching, dense, fine)
 
 
@@ -123,11 +123,11 @@ def level(source: Points, target: Points, count: int) -> Level:
         source, target = downsample(source, voxel_size), downsample(target, voxel_size)
     else:  # a voxel grid merges copies of a point, too
         source, target = np.unique(source, axis=0), np.unique(target, axis=0)
-    return Level(source, target, max(_spacing(source), _spacing(target)))
+    return Level(source, target, max(spacing_of(source), spacing_of(target)))
 
 
-def _spacing(points: Points) -> float:
-    """The median distance of a point to its nearest neighbour that is not at the same place, of some of the points."""
+def spacing_of(points: Points) -> float:
+    """The median distance of a point of (N, 3) to its nearest neighbour at another place, of some of the points."""
     some = points[:: max(1, len(points) // SAMPLE)]
     distance = cKDTree(points, compact_nodes=False, balanced_tree=False).query(some, k=2)[0][:, 1]
     return float(np.median(distance[distance > 0]))

@@ -26,15 +26,13 @@ from idam.refine import refine as refine_once
 from idam.result import Hypothesis, Matches, RegistrationResult
 from idam.scoring import inliers
 from idam.search import inverse, search
+from idam.sparse import FEW_POINTS, align_few
 
 __all__ = ["register"]
 
 log = logging.getLogger(__name__)
 
 Points = NDArray[np.float64]
-
-FEW_POINTS = 1024
-"""Points of the larger cloud up to which the last refinement ends point to point."""
 
 
 def register(
@@ -160,21 +158,14 @@ def smaller_first(source: Points, target: Points) -> bool:
 
 
 def finish(transformation: Points, fine: Level, method: str) -> tuple[Points, NDArray[np.float64]]:
-    """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6).
-
-    Normals of few points are coarse, and more so with noise: there the points themselves have the last word.
-    """
+    """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6)."""
     if method == "none":
         return transformation, np.zeros((6, 6))
-    surfaces = fine.surfaces
-    transformation, information = refine_once(
-        surfaces.source, surfaces.target, transformation, 2.0 * fine.spacing, method
-    )
+    source, target, reach = fine.surfaces.source, fine.surfaces.target, 2.0 * fine.spacing
     if method == "gicp" and max(len(fine.source), len(fine.target)) <= FEW_POINTS:
-        transformation, _ = refine_once(
-            surfaces.source, surfaces.target, transformation, fine.spacing, "point", iterations=100
-        )
-    return transformation, information
+        transformation = align_few(source, target, transformation, fine.spacing)
+        return transformation, refine_once(source, target, transformation, reach, method, iterations=1)[1]
+    return refine_once(source, target, transformation, reach, method)
 
 
 def in_input_units(matches: Matches, frame: Frame) -> Matches:

@@ -13,13 +13,12 @@ from idam.errors import InputError
 from idam.evaluation.methods import ABLATION, RIVALS, Method
 from idam.evaluation.methods.learned.weights import rival_weights_for
 from idam.network.pretrained import list_models, load_model
-from idam.refine import Refinable, refine
+from idam.pyramid import spacing_of
+from idam.refine import Refinable
 from idam.settings import with_settings
+from idam.sparse import align_few
 
 __all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
-
-ICP_DISTANCE = 0.1
-"""Largest distance of a match of ICP after the network, in the units of shapes in the unit sphere."""
 
 
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
@@ -33,12 +32,13 @@ def fpfh(model: str | None, settings: Sequence[str]) -> Method:
 
 
 def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
-    """The network on GNN features, and point-to-point ICP after it."""
+    """The network on GNN features, and a symmetric ICP after it, as :func:`idam.register` ends sparse clouds with."""
     network = gnn(model, settings)
 
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
         moving, fixed = (Refinable.build(cloud.astype(np.float64)) for cloud in (source, target))
-        return refine(moving, fixed, network(source, target), ICP_DISTANCE, "point")[0]
+        spacing = max(spacing_of(cloud.points) for cloud in (moving, fixed))
+        return align_few(moving, fixed, network(source, target), spacing)
 
     return run
 
