@@ -304,7 +304,7 @@ def test_refuses_files(work: Path, call: Call, file: str, words: str) -> None:
         ("--voxel-size", "wide", "--voxel-size"),
         ("--voxel-size", "nan", "voxel_size"),
         ("--max-correspondence-distance", "-1", "max_correspondence_distance"),
-        ("--refine", "magic", "gicp, plane, point or none"),
+        ("--refine", "magic", "gicp, plane, point, symmetric or none"),
         ("--seed", "one", "--seed"),
         ("--seed", "1" * 30, "seed"),
         ("--device", "abacus", "abacus"),

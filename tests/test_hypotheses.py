@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from idam.geometry import random_rotation
-from idam.hypotheses import as_transform, propose, starting_rotations
+from idam.hypotheses import as_transforms, propose, starting_rotations
 from idam.network.config import Config
 from idam.network.model import IDAM, KeyPoints, Output
 from idam.network.pretrained import load_model
@@ -126,13 +126,14 @@ def test_transforms_are_rigid_in_double_precision(
         np.testing.assert_array_equal(transformation[3], [0, 0, 0, 1])
 
 
-def test_as_transform_takes_the_rotation_nearest_to_an_inexact_one(generator: torch.Generator) -> None:
-    rotation = random_rotation(1, generator=generator, dtype=torch.float64)[0]
-    transformation = as_transform((rotation + 1e-4 * torch.randn(3, 3, generator=generator)).float(), SHIFT)
-    np.testing.assert_allclose(transformation[:3, :3], rotation, atol=1e-3)
-    np.testing.assert_allclose(transformation[:3, :3] @ transformation[:3, :3].T, np.eye(3), atol=1e-12)
-    np.testing.assert_array_equal(transformation[:3, 3], SHIFT.double())
-    np.testing.assert_array_equal(transformation[3], [0, 0, 0, 1])
+def test_as_transforms_takes_the_rotations_nearest_to_inexact_ones(generator: torch.Generator) -> None:
+    rotations = random_rotation(5, generator=generator, dtype=torch.float64)
+    inexact = (rotations + 1e-4 * torch.randn(5, 3, 3, generator=generator)).float()
+    for rotation, transformation in zip(rotations, as_transforms(inexact, SHIFT.expand(5, 3)), strict=True):
+        np.testing.assert_allclose(transformation[:3, :3], rotation, atol=1e-3)
+        np.testing.assert_allclose(transformation[:3, :3] @ transformation[:3, :3].T, np.eye(3), atol=1e-12)
+        np.testing.assert_array_equal(transformation[:3, 3], SHIFT.double())
+        np.testing.assert_array_equal(transformation[3], [0, 0, 0, 1])
 
 
 @pytest.mark.parametrize("trained", [False, True])

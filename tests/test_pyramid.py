@@ -11,10 +11,10 @@ from idam import pyramid
 from idam.errors import InputError
 from idam.preprocess import MIN_POINTS
 from idam.pyramid import (
-    DENSE_POINTS,
     FINE_POINTS,
     FINEST,
     MATCHING_POINTS,
+    MOST_POINTS,
     NETWORK_POINTS,
     SAMPLE,
     Level,
@@ -34,8 +34,12 @@ def large() -> Pyramid:
     return build_pyramid(shell(45_000, 1), 0.7 * shell(20_000, 2), None)
 
 
+def levels(clouds: Pyramid) -> tuple[Level, ...]:
+    return clouds.small, clouds.larger, clouds.fine
+
+
 def same(a: Pyramid, b: Pyramid) -> None:
-    for one, other in zip(a.levels, b.levels, strict=True):
+    for one, other in zip(levels(a), levels(b), strict=True):
         np.testing.assert_array_equal(one.source, other.source)
         np.testing.assert_array_equal(one.target, other.target)
         assert one.spacing == other.spacing
@@ -49,7 +53,7 @@ def spacing_by_definition(points: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("name", "count"),
-    [("small", NETWORK_POINTS), ("matching", MATCHING_POINTS), ("dense", DENSE_POINTS), ("fine", FINE_POINTS)],
+    [("small", NETWORK_POINTS), ("larger", MATCHING_POINTS), ("fine", FINE_POINTS)],
 )
 def test_larger_cloud_has_about_so_many_points_and_no_more(large: Pyramid, name: str, count: int) -> None:
     level: Level = getattr(large, name)
@@ -58,24 +62,18 @@ def test_larger_cloud_has_about_so_many_points_and_no_more(large: Pyramid, name:
     assert 0.3 * len(level.source) < len(level.target) < 0.7 * len(level.source)
 
 
-def test_levels_are_given_the_coarsest_first(large: Pyramid) -> None:
-    assert large.levels == (large.small, large.matching, large.dense, large.fine)
-    spacings = [level.spacing for level in large.levels]
-    assert spacings == sorted(spacings, reverse=True)
-
-
 def test_points_of_every_level_lie_on_the_surface(large: Pyramid) -> None:
-    for level in (large.small, large.matching, large.dense):
+    for level in (large.small, large.larger):
         # a mean of the points in a voxel lies a little inside
         assert np.abs(np.linalg.norm(level.source / [0.9, 0.6, 0.5], axis=1) - 1).max() < level.spacing
 
 
 def test_spacing_is_that_of_the_cloud_with_the_wider(large: Pyramid) -> None:
-    for level in (large.small, large.matching):
+    for level in (large.small, large.larger):
         expected = max(map(spacing_by_definition, (level.source, level.target)))
         assert level.spacing == pytest.approx(expected, rel=1e-6)
     sparse = build_pyramid(shell(900, 1), shell(100, 2), None)
-    assert sparse.dense.spacing == pytest.approx(spacing_by_definition(shell(100, 2)))
+    assert sparse.fine.spacing == pytest.approx(spacing_by_definition(shell(100, 2)))
 
 
 def test_spacing_of_many_points_is_that_of_some_all_over_the_cloud() -> None:
@@ -102,7 +100,9 @@ def test_a_level_has_about_as_many_points_as_asked_for(count: int) -> None:
 
 def test_few_points_stay_as_they_are_on_every_level() -> None:
     source, target = shell(300, 1), shell(200, 2)
-    for level in build_pyramid(source, target, None).levels:
+    clouds = build_pyramid(source, target, None)
+    assert clouds.larger is clouds.small
+    for level in levels(clouds):
         np.testing.assert_array_equal(level.source, np.unique(source, axis=0))
         np.testing.assert_array_equal(level.target, np.unique(target, axis=0))
 
@@ -113,7 +113,7 @@ def test_copies_of_points_change_nothing() -> None:
 
 
 def test_swapped_exchanges_source_and_target(large: Pyramid) -> None:
-    for level, other in zip(large.levels, large.swapped().levels, strict=True):
+    for level, other in zip((large.small, large.fine), (large.swapped().small, large.swapped().fine), strict=True):
         assert other.source is level.target
         assert other.target is level.source
         assert other.spacing == level.spacing
@@ -129,7 +129,6 @@ def test_swapped_is_the_pyramid_of_the_swapped_clouds() -> None:
 def test_surfaces_are_those_of_the_level_and_made_once(large: Pyramid) -> None:
     level = large.small
     assert level.surfaces is level.surfaces
-    assert level.surfaces.spacing == level.spacing
     np.testing.assert_array_equal(level.surfaces.source.points, level.source)
     np.testing.assert_array_equal(level.surfaces.target.points, level.target)
 
@@ -137,17 +136,21 @@ def test_surfaces_are_those_of_the_level_and_made_once(large: Pyramid) -> None:
 # --- voxel_size ----------------------------------------------------------------------------------------------------
 
 
-def test_voxel_size_sets_both_coarse_levels_and_no_other() -> None:
+def test_larger_clouds_are_made_once(large: Pyramid) -> None:
+    assert large.larger is large.larger
+    assert not large.all_small
+
+
+def test_voxel_size_sets_the_clouds_to_match_and_no_other() -> None:
     source, target = shell(6000, 1), shell(3000, 2)
     given, chosen = build_pyramid(source, target, 0.2), build_pyramid(source, target, None)
-    assert given.small is given.matching
+    assert given.small is given.larger
     assert MIN_POINTS < len(given.small.source) < 500
     wider = build_pyramid(source, target, 0.3).small
     assert len(wider.source) < len(given.small.source)
     assert wider.spacing > given.small.spacing
-    for level, other in ((given.dense, chosen.dense), (given.fine, chosen.fine)):
-        np.testing.assert_array_equal(level.source, other.source)
-        np.testing.assert_array_equal(level.target, other.target)
+    np.testing.assert_array_equal(given.fine.source, chosen.fine.source)
+    np.testing.assert_array_equal(given.fine.target, chosen.fine.target)
 
 
 def test_voxel_size_below_the_finest_counts_as_the_finest() -> None:
@@ -164,8 +167,8 @@ def test_voxel_size_that_leaves_too_little_of_a_cloud_is_refused_by_its_name(sma
 
 @pytest.mark.parametrize("large_is", ["source", "target"])
 def test_voxel_size_that_leaves_more_than_fits_is_refused_by_name(large_is: str) -> None:
-    clouds = shell(DENSE_POINTS + 500, 1), shell(500, 2)
-    with pytest.raises(InputError, match=rf"^{large_is}: \d+ points .*at most {DENSE_POINTS} .*larger voxel_size"):
+    clouds = shell(MOST_POINTS + 500, 1), shell(500, 2)
+    with pytest.raises(InputError, match=rf"^{large_is}: \d+ points .*at most {MOST_POINTS} .*larger voxel_size"):
         build_pyramid(*(clouds if large_is == "source" else clouds[::-1]), 1e-3)
 
 

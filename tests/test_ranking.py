@@ -7,9 +7,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from idam.matching import FEW, TOUCHING, Matching
-from idam.pyramid import Level, Surfaces
-from idam.ranking import UNLIKELY, Answer, alike, distinct, improve
+from idam.matching import FEW, Matching
+from idam.pyramid import Level
+from idam.ranking import UNLIKELY, Answer, alike, distinct, improve, likeliest
+from idam.refine import TOUCHING
 from idam.scoring import agreement
 from matchings import as_matches, matching_by, scores_for
 
@@ -104,38 +105,33 @@ def boxes(count: int, seed: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def surfaces() -> Surfaces:
-    """Two samplings of one thing in one pose."""
-    return Level(boxes(800, seed=1), boxes(800, seed=2), 0.03).surfaces
-
-
-@pytest.fixture(scope="module")
 def matching() -> Matching:
-    """What coarser clouds say: of their matches two of three are right under the identity, and so are the scores."""
+    """Two samplings of one thing in one pose: two of three matches are right under the identity, and so are scores."""
     points = np.random.default_rng(0).normal(size=(30, 3))
     wrong = np.array([0.0, 0.0, 0.0, 0.0, 5.0, 5.0]).repeat(5)[:, None]
-    clouds = Level(boxes(300, seed=3), boxes(250, seed=4), 0.05)
+    clouds = Level(boxes(800, seed=1), boxes(800, seed=2), 0.03)
     return matching_by(clouds, scores_for(clouds, rigid()), as_matches(points, points + wrong, 0.045))
 
 
 STARTS = [rigid(170), rigid(6, 0.05), rigid(), rigid(60, 0.3)]
 
 
-def test_improve_without_refinement_only_scores(surfaces: Surfaces, matching: Matching) -> None:
-    found = improve([Answer(start, overlap=7.0) for start in STARTS], surfaces, matching, 4.0, "none")
+def test_improve_without_refinement_only_scores(matching: Matching) -> None:
+    clouds = matching.clouds
+    found = improve([Answer(start, overlap=7.0) for start in STARTS], matching, 4.0, "none")
     assert len(found) == len(STARTS)
     for a, start in zip(found, STARTS, strict=True):
         assert (a.transformation == start).all()
         assert a.support == matching.matches.support(start)
         assert a.likelihood == matching.likelihood(start)
-        expected = agreement(surfaces.source, surfaces.target, start, TOUCHING * surfaces.spacing)
+        expected = agreement(clouds.surfaces.source, clouds.surfaces.target, start, TOUCHING * clouds.spacing)
         assert a.overlap == expected.score
     assert max(found, key=lambda a: a.score) is found[2]
     assert found[2].support == pytest.approx(20 / (30 + FEW))
 
 
-def test_improve_refines_each_and_scores_what_it_refined(surfaces: Surfaces, matching: Matching) -> None:
-    unrefined, refined = (improve(list(map(Answer, STARTS)), surfaces, matching, 4.0, m) for m in ("none", "gicp"))
+def test_improve_refines_each_and_scores_what_it_refined(matching: Matching) -> None:
+    unrefined, refined = (improve(list(map(Answer, STARTS)), matching, 4.0, m) for m in ("none", "gicp"))
     assert len(refined) == len(STARTS)
     assert refined[1].overlap > 0.7 > 0.5 > unrefined[1].overlap
     assert refined[1].support == pytest.approx(20 / (30 + FEW))
@@ -148,11 +144,21 @@ def test_improve_refines_each_and_scores_what_it_refined(surfaces: Surfaces, mat
     assert not alike(refined[-1].transformation, np.eye(4))
 
 
-def test_refinement_reaches_only_so_far(surfaces: Surfaces, matching: Matching) -> None:
+def test_refinement_reaches_only_so_far(matching: Matching) -> None:
     start = Answer(rigid(6, 0.05))
-    near, far = (improve([start], surfaces, matching, reach, "gicp")[0].overlap for reach in (0.3, 4.0))
+    near, far = (improve([start], matching, reach, "gicp")[0].overlap for reach in (0.3, 4.0))
     assert near < 0.6 < 0.7 < far
 
 
-def test_nothing_to_improve(surfaces: Surfaces, matching: Matching) -> None:
-    assert improve([], surfaces, matching, 4.0, "gicp") == []
+def test_nothing_to_improve(matching: Matching) -> None:
+    assert improve([], matching, 4.0, "gicp") == []
+
+
+def test_the_likeliest_come_first_and_no_more_than_asked_for(matching: Matching) -> None:
+    answers = [Answer(rigid(degrees, 0.01 * degrees)) for degrees in (40, 3, 170, 0, 9)]
+    kept = likeliest(answers, matching, 3)
+    assert kept == [answers[3], answers[1], answers[4]]
+    likelihood = [matching.likelihood(answer.transformation) for answer in kept]
+    assert likelihood == sorted(likelihood, reverse=True)
+    assert len(likeliest(answers, matching, 9)) == len(answers)
+    assert likeliest([], matching, 3) == []

@@ -118,5 +118,5 @@ def test_a_touch_of_a_few_points_is_no_overlap(pair: Pair) -> None:
 
 def test_unknown_method(pair: Pair) -> None:
     source, target, truth = pair
-    with pytest.raises(InputError, match=r"^unknown refinement 'magic': choose gicp, plane, point or none$"):
+    with pytest.raises(InputError, match=r"^unknown refinement 'magic': choose gicp, plane, point, symmetric or none$"):
         refine(source, target, truth, DISTANCE, "magic")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from idam.geometry import gather_points, weighted_procrustes
-from idam.hypotheses import as_transform
+from idam.hypotheses import as_transforms
 from idam.matching import FeatureMatches
 
 __all__ = ["agreeing_transforms"]
@@ -50,8 +50,8 @@ def agreeing_transforms(matches: FeatureMatches, seeds: int) -> list[Points]:
         together = _brought_together(sources, targets, rotation, translation, tolerance)
         rotation, translation = weighted_procrustes(sources, targets, together)
     number = _brought_together(sources, targets, rotation, translation, tolerance).sum(1)
-    order = number.sort(descending=True, stable=True)
-    return [as_transform(rotation[n], translation[n]) for n in order.indices.tolist()]
+    order = number.sort(descending=True, stable=True).indices
+    return as_transforms(rotation[order], translation[order])
 
 
 def _second_order_compatibility(source: Tensor, target: Tensor, tolerance: float) -> Tensor:

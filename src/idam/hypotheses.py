@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from idam.geometry import compose, gather_points, random_rotation
 from idam.network.model import IDAM, KeyPoints
 
-__all__ = ["as_transform", "nearest_rotation", "propose", "starting_rotations"]
+__all__ = ["as_transforms", "nearest_rotation", "propose", "starting_rotations"]
 
 Points = NDArray[np.float64]
 
@@ -46,16 +46,16 @@ def propose(network: IDAM, source: Points, target: Points, starts: torch.Tensor)
     source_keys = _key_points(network, source, starts, same=network.features.rotation_invariant)
     output = network.match(source_keys, target_keys)
     rotation, translation = compose(output.rotation, output.translation, starts, torch.zeros_like(output.translation))
-    order = output.trust.sort(descending=True, stable=True).indices.tolist()
-    return [as_transform(rotation[n], translation[n]) for n in order]
+    order = output.trust.sort(descending=True, stable=True).indices
+    return as_transforms(rotation[order], translation[order])
 
 
-def as_transform(rotation: torch.Tensor, translation: torch.Tensor) -> Points:
-    """Rotation (3, 3) and translation (3,) in single precision as a rigid (4, 4) in double."""
-    transformation = np.eye(4)
-    transformation[:3, :3] = nearest_rotation(rotation.double().cpu().numpy())
-    transformation[:3, 3] = translation.double().cpu().numpy()
-    return transformation
+def as_transforms(rotation: torch.Tensor, translation: torch.Tensor) -> list[Points]:
+    """Rotations (S, 3, 3) and translations (S, 3) in single precision as S rigid transforms (4, 4) in double."""
+    transformation = np.tile(np.eye(4), (len(rotation), 1, 1))
+    transformation[:, :3, :3] = nearest_rotation(rotation.double().cpu().numpy())
+    transformation[:, :3, 3] = translation.double().cpu().numpy()
+    return list(transformation)
 
 
 def _key_points(network: IDAM, points: Points, turns: torch.Tensor, *, same: bool) -> KeyPoints:
@@ -71,6 +71,6 @@ def _key_points(network: IDAM, points: Points, turns: torch.Tensor, *, same: boo
 
 
 def nearest_rotation(matrix: Points) -> Points:
-    """The rotation nearest to one (3, 3) that is inexact: composed in single precision, or written with few digits."""
+    """The rotation nearest to one (..., 3, 3) that is inexact: composed in single precision, or written briefly."""
     u, _, vh = np.linalg.svd(matrix)
     return np.asarray(u @ vh)

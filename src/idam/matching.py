@@ -16,6 +16,7 @@ from idam.network.features.invariant import Invariant, Surroundings, surrounding
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model
 from idam.pyramid import Level
+from idam.refine import TOUCHING
 from idam.scoring import touching
 
 __all__ = ["FeatureMatches", "Matching", "mutual_matches"]
@@ -24,7 +25,7 @@ Points = NDArray[np.float64]
 
 RANK = 2
 """Two points match where each is among the other's so many best."""
-MATCHES = 1000
+MATCHES = 600
 """Matches at most, the likeliest: the compatibility matrix grows with their square."""
 TOLERANCE = 1.5
 """Spacings by which distances between two matches may differ, and by which a match may miss."""
@@ -32,8 +33,6 @@ REACH = 1.7
 """Tolerances within which a refined transform counts as bringing a match together."""
 FEW = 50
 """Matches that must be there before a share of them says much."""
-TOUCHING = 1.5
-"""Spacings within which a transform makes two points one."""
 AGAINST, FOR = -2.0, 4.0
 """Least and most that one pair of points says against or for a transform, as a logarithm of likelihoods."""
 

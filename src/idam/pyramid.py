@@ -21,11 +21,11 @@ NETWORK_POINTS = 1024
 """Points of the larger cloud that the network sees: what it was trained on."""
 MATCHING_POINTS = 2000
 """Points of the larger cloud that features are matched on."""
-DENSE_POINTS = 4096
-"""Points of the larger cloud that hypotheses are refined and scored on."""
+MOST_POINTS = 4096
+"""Points of either cloud at most that features are matched on, where the caller chooses the voxel size."""
 FINE_POINTS = 10_000
 """Points of the larger cloud that the last refinement uses."""
-SAMPLE = 2000
+SAMPLE = 1000
 """Points at least whose nearest neighbours tell the spacing of a cloud."""
 FINEST = 1e-4
 """Smallest voxel size, in working units: far below the spacing of the fine clouds, and small_gicp's grid has room."""
@@ -33,11 +33,10 @@ FINEST = 1e-4
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Both clouds at one resolution, ready for refinement, and the spacing of their points."""
+    """Both clouds at one resolution, ready for refinement."""
 
     source: Refinable
     target: Refinable
-    spacing: float
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,12 @@ class Level:
     @cached_property
     def surfaces(self) -> Surfaces:
         """The clouds with normals, ready for refinement."""
-        return Surfaces(Refinable.build(self.source), Refinable.build(self.target), self.spacing)
+        return Surfaces(Refinable.build(self.source), Refinable.build(self.target))
+
+    @property
+    def size(self) -> int:
+        """Points of the larger cloud."""
+        return max(len(self.source), len(self.target))
 
     def swapped(self) -> Level:
         """With source and target exchanged."""
@@ -60,21 +64,27 @@ class Level:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Both clouds for the network, for matching features, for ranking hypotheses, and for the last refinement."""
+    """Both clouds at the resolutions that features are matched on, and at that of the last refinement.
+
+    Attributes:
+        small: what the network sees, and what is matched first.
+        fine: for the last refinement.
+        all_small: whether there are no larger clouds to match: the small ones hold all points, or the caller chose
+            them.
+    """
 
     small: Level
-    matching: Level
-    dense: Level
     fine: Level
+    all_small: bool = False
 
-    @property
-    def levels(self) -> tuple[Level, ...]:
-        """All of them, the coarsest first."""
-        return self.small, self.matching, self.dense, self.fine
+    @cached_property
+    def larger(self) -> Level:
+        """What is matched where the small clouds do not settle the matter: made only then."""
+        return self.small if self.all_small else level(self.fine.source, self.fine.target, MATCHING_POINTS)
 
     def swapped(self) -> Pyramid:
         """With source and target exchanged."""
-        return Pyramid(*(level.swapped() for level in self.levels))
+        return Pyramid(self.small.swapped(), self.fine.swapped(), self.all_small)
 
 
 def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> Pyramid:
@@ -83,23 +93,20 @@ def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> P
     Args:
         source: working points (N, 3).
         target: working points (P, 3).
-        voxel_size: of the two coarse levels, in working units; None to take it from the data.
+        voxel_size: of the clouds to match, in working units; None to take it from the data.
 
     Raises:
-        InputError: too few or too many points are left at the coarse levels.
+        InputError: too few or too many points are left to match.
     """
     fine = level(source, target, FINE_POINTS)
-    dense = level(fine.source, fine.target, DENSE_POINTS)
     if voxel_size is None:
-        matching = level(fine.source, fine.target, MATCHING_POINTS)
-        small = level(dense.source, dense.target, NETWORK_POINTS)
+        small = level(fine.source, fine.target, NETWORK_POINTS)
         _check_number(small.source, small.target)
-    else:
-        voxel_size = max(voxel_size, FINEST)
-        few = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
-        _check_number(*few)
-        small = matching = Level(few[0], few[1], max(map(spacing_of, few)))
-    return Pyramid(small, matching, dense, fine)
+        return Pyramid(small, fine, all_small=fine.size <= NETWORK_POINTS)
+    voxel_size = max(voxel_size, FINEST)
+    few = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
+    _check_number(*few)
+    return Pyramid(Level(few[0], few[1], max(map(spacing_of, few))), fine, all_small=True)
 
 
 def _check_number(source: Points, target: Points) -> None:
@@ -109,9 +116,9 @@ def _check_number(source: Points, target: Points) -> None:
                 f"{name}: {len(points)} points are left at the network's resolution, at least {MIN_POINTS} are needed; "
                 "crop the other cloud to its size, or give a smaller voxel_size"
             )
-        if len(points) > DENSE_POINTS:
+        if len(points) > MOST_POINTS:
             raise InputError(
-                f"{name}: {len(points)} points are left at this voxel_size, at most {DENSE_POINTS} fit the network; "
+                f"{name}: {len(points)} points are left at this voxel_size, at most {MOST_POINTS} fit the network; "
                 "give a larger voxel_size"
             )
 

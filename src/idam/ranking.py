@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.matching import TOUCHING, Matching
-from idam.pyramid import Surfaces
-from idam.refine import refine
+from idam.matching import Matching
+from idam.refine import TOUCHING, refine
 from idam.scoring import agreement
 
-__all__ = ["Answer", "distinct", "improve"]
+__all__ = ["Answer", "distinct", "improve", "likeliest"]
 
 Points = NDArray[np.float64]
 
@@ -49,19 +48,29 @@ class Answer:
         return max(self.likelihood, 0.0) + UNLIKELY * self.overlap
 
 
-def improve(answers: list[Answer], surfaces: Surfaces, matching: Matching, reach: float, method: str) -> list[Answer]:
-    """Each answer refined within ``reach`` spacings (unless the method is ``none``) and scored."""
+def improve(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
+    """Each answer refined on the matched clouds, within ``reach`` spacings (with method ``none`` not), and scored."""
+    surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
+    source, target = surfaces.source, surfaces.target
     improved = []
     for answer in answers:
         transformation = answer.transformation
         if method != "none":
-            transformation, _ = refine(
-                surfaces.source, surfaces.target, transformation, reach * surfaces.spacing, method, ITERATIONS
-            )
-        overlap = agreement(surfaces.source, surfaces.target, transformation, TOUCHING * surfaces.spacing).score
+            transformation, _ = refine(source, target, transformation, reach * spacing, method, ITERATIONS)
+        overlap = agreement(source, target, transformation, TOUCHING * spacing).score
         support = matching.matches.support(transformation)
         improved.append(Answer(transformation, overlap, support, matching.likelihood(transformation)))
     return improved
+
+
+def likeliest(answers: list[Answer], matching: Matching, most: int) -> list[Answer]:
+    """The ``most`` likeliest of the answers as they are, the likeliest first.
+
+    Next to refining an answer, to ask for its likelihood costs nothing; and to refine more of them gains nothing.
+    """
+    likelihood = [matching.likelihood(answer.transformation) for answer in answers]
+    order = np.argsort(likelihood, kind="stable")[::-1]
+    return [answers[n] for n in order[:most]]
 
 
 def distinct(answers: Iterable[Answer], most: int | None = None) -> list[Answer]:

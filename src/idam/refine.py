@@ -1,4 +1,4 @@
-"""Fine alignment on dense clouds through small_gicp."""
+"""Fine alignment: small_gicp's, and a symmetric one for sparse clouds."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from idam.errors import InputError
+from idam.symmetric import symmetric_icp
 
-__all__ = ["METHODS", "Refinable", "refine"]
+__all__ = ["METHODS", "TOUCHING", "Refinable", "refine", "refine_few"]
 
 Points = NDArray[np.float64]
 
-METHODS = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
-"""Fine alignments by name: generalised ICP, point to plane (as small_gicp has it: each coordinate of the distance times
-the normal's, rather than their inner product), point to point."""
+SMALL_GICP = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
+METHODS = (*SMALL_GICP, "symmetric")
+"""Fine alignments: generalised ICP, point to plane (as small_gicp has it: each coordinate of the distance times the
+normal's, rather than their inner product), point to point, and symmetric (:mod:`idam.symmetric`)."""
+FEW_REACH = 1.7
+"""Spacings within which sparse clouds' points pull on each other at last."""
+TOUCHING = 1.5
+"""Spacings within which a transform makes two points one."""
+COPIES = 0.75
+"""Median distance of points that lie on each other, in spacings, below which they are copies of the same points."""
 
 NEIGHBOURS = 15
 """Points that each normal and covariance is estimated from."""
@@ -43,7 +52,10 @@ class Refinable:
 
         cloud = small_gicp.PointCloud(points)
         tree = small_gicp.KdTree(cloud)
-        small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=min(NEIGHBOURS, len(points)))
+        # each point for itself, so that the number of threads changes no bit
+        small_gicp.estimate_normals_covariances(
+            cloud, tree, num_neighbors=min(NEIGHBOURS, len(points)), num_threads=torch.get_num_threads()
+        )
         return cls(cloud, tree)
 
     @cached_property
@@ -86,12 +98,14 @@ def refine(
 
     if method not in METHODS:
         raise InputError(f"unknown refinement {method!r}: choose {', '.join(METHODS)} or none")
+    if method == "symmetric":
+        return symmetric_icp(source, target, start, distance, iterations)
     result = small_gicp.align(
         target.cloud,
         source.cloud,
         target.tree,
         start,
-        registration_type=METHODS[method],
+        registration_type=SMALL_GICP[method],
         max_correspondence_distance=distance,
         num_threads=1,
         max_iterations=iterations,
@@ -102,3 +116,19 @@ def refine(
     if result.num_inliers < 10 or not np.isfinite(transformation).all():
         return start, np.zeros((6, 6))
     return transformation, np.asarray(result.H)
+
+
+def refine_few(
+    source: Refinable, target: Refinable, start: Points, spacing: float
+) -> tuple[Points, NDArray[np.float64]]:
+    """The last refinement of sparse clouds, whose noise and gaps are large: symmetric, as :func:`refine`.
+
+    Where points turn out to be copies of the other cloud's, as in the paper's protocol, they have the last word.
+    """
+    transformation, information = refine(source, target, start, FEW_REACH * spacing, "symmetric")
+    moved = source.points @ transformation[:3, :3].T + transformation[:3, 3]
+    distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
+    touching = distance[np.isfinite(distance)]
+    if len(touching) and np.median(touching) < COPIES * spacing:
+        return refine(source, target, transformation, spacing, "point", iterations=100)
+    return transformation, information

@@ -21,18 +21,20 @@ from idam.network.model import IDAM
 from idam.network.pretrained import find, load_model
 from idam.preprocess import Frame, check_points, common_frame, without_strays
 from idam.pyramid import Level, build_pyramid
-from idam.refine import METHODS
+from idam.refine import METHODS, TOUCHING, refine_few
 from idam.refine import refine as refine_once
 from idam.result import Hypothesis, Matches, RegistrationResult
 from idam.scoring import inliers
 from idam.search import inverse, search
-from idam.sparse import FEW_POINTS, align_few
 
 __all__ = ["register"]
 
 log = logging.getLogger(__name__)
 
 Points = NDArray[np.float64]
+
+FEW_POINTS = 1024
+"""Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
 
 
 def register(
@@ -55,10 +57,10 @@ def register(
         model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them.
         init: (4, 4), a guess of the transform: an answer to consider, and where the network's starts turn around.
         voxel_size: of the clouds that matches are sought in, in the input's units; None takes it from the data.
-        max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for the spacing
-            of the points the clouds were scored on.
-        refine: fine alignment on the dense clouds, ``gicp``, ``plane`` or ``point``; None or ``none`` for the
-            network's answer alone.
+        max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for one and a
+            half spacings of the points of the last refinement.
+        refine: fine alignment, ``gicp`` (``symmetric`` for clouds of up to 1024 points), ``plane``, ``point`` or
+            ``symmetric``; None or ``none`` for the network's answer alone.
         seed: of the starting rotations.
         device: where the network runs; None for the CPU.
 
@@ -76,9 +78,9 @@ def register(
     frame = common_frame(source_points, target_points)
     working = without_strays(frame.source(source_points)), without_strays(frame.target(target_points))
     clouds = build_pyramid(*working, voxel_size and voxel_size / frame.scale)
-    log.info("points at each resolution: %s", ", ".join(f"{len(x.source)} + {len(x.target)}" for x in clouds.levels))
+    log.info("points to match: %d + %d", len(clouds.small.source), len(clouds.small.target))
     guess = np.eye(4) if init is None else frame.enter(as_rigid(init))
-    method = refine or "none"
+    method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
     # always searched in the same direction, so that swapping the clouds inverts the answer
     if smaller_first(*working):
         found = search(clouds, network, guess, int(seed), method)
@@ -86,7 +88,7 @@ def register(
         found = search(clouds.swapped(), network, inverse(guess), int(seed), method).inverted()
     transformation, information = finish(found.answers[0].transformation, clouds.fine, method)
     full = frame.undo(transformation)
-    distance = float(max_correspondence_distance or clouds.dense.spacing * frame.scale)
+    distance = float(max_correspondence_distance or TOUCHING * clouds.fine.spacing * frame.scale)
     moved = source_points @ full[:3, :3].T + full[:3, 3]
     correspondence_set, rmse = inliers(moved, target_points, distance)
     sure = confidence(found.evidence)
@@ -161,11 +163,10 @@ def finish(transformation: Points, fine: Level, method: str) -> tuple[Points, ND
     """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6)."""
     if method == "none":
         return transformation, np.zeros((6, 6))
-    source, target, reach = fine.surfaces.source, fine.surfaces.target, 2.0 * fine.spacing
-    if method == "gicp" and max(len(fine.source), len(fine.target)) <= FEW_POINTS:
-        transformation = align_few(source, target, transformation, fine.spacing)
-        return transformation, refine_once(source, target, transformation, reach, method, iterations=1)[1]
-    return refine_once(source, target, transformation, reach, method)
+    surfaces = fine.surfaces
+    if method == "symmetric":
+        return refine_few(surfaces.source, surfaces.target, transformation, fine.spacing)
+    return refine_once(surfaces.source, surfaces.target, transformation, 2.0 * fine.spacing, method)
 
 
 def in_input_units(matches: Matches, frame: Frame) -> Matches:

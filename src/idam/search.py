@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from idam.matching import Matching
 from idam.network.features.invariant import Invariant
 from idam.network.model import IDAM
 from idam.pyramid import Level, Pyramid
-from idam.ranking import Answer, distinct, improve
+from idam.ranking import Answer, distinct, improve, likeliest
 from idam.result import Matches
 
 __all__ = ["Found", "inverse", "search"]
@@ -28,12 +28,19 @@ Points = NDArray[np.float64]
 
 STARTS = 24
 """Rotations of the source that a network of the paper's kind starts from."""
-SEEDS = 200, 1000
+SEEDS = 200, 600
 """Matches that sets of agreeing ones are grown from, on the small clouds and on the larger ones."""
-HYPOTHESES = 16, 64
-"""Different transforms among those that the sets agree on that are looked into, likewise."""
+HYPOTHESES = 64
+"""Different transforms, among those that the sets agree on, whose likelihood is asked for."""
+EXAMINED = 8
+"""The likeliest of them, which are refined."""
 CONTENDERS = 6
-"""Answers that stay in the race on the dense clouds, and against what larger ones say."""
+"""Answers that are kept, and that stay in the race against what larger clouds say."""
+REACH = {"symmetric": 2.5}
+"""Spacings within which points pull on each other, by the method of refinement; 1 for others, which draw right answers
+of little overlap away with a longer reach."""
+STARTED = 4.0
+"""Likewise, after the network."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -69,8 +76,8 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     """The answers that explain both clouds best.
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
-    larger ones are, and looked into more closely; the best answers so far have to stand against what they say. At
-    last a network of the paper's kind, whose matches depend on the pose, is asked from many rotations.
+    larger ones are; the best answers so far have to stand against what they say. At last a network of the paper's kind,
+    whose matches depend on the pose, is asked from many rotations.
 
     Args:
         clouds: in working coordinates.
@@ -80,11 +87,11 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         method: of refinement, or ``none``.
     """
     candidates = [Answer(guess)]
-    for level, seeds, hypotheses in zip((clouds.small, clouds.matching), SEEDS, HYPOTHESES, strict=True):
+    for level, seeds in to_match(clouds):
         matching = Matching.of(network, level)
         agreed = map(Answer, agreeing_transforms(matching.matches, seeds))
-        candidates = distinct([*candidates, *agreed], hypotheses)
-        answers = settle(candidates, clouds.dense, matching, 2.0, method)
+        candidates = likeliest(distinct([*candidates, *agreed], HYPOTHESES), matching, EXAMINED)
+        answers = settle(candidates, matching, REACH.get(method, 1.0), method)
         found = examine(least_turned(answers, guess), matching)
         sure = confidence(found.evidence)
         log.info(
@@ -98,14 +105,20 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
     learned = distinct(map(Answer, propose(network, clouds.small.source, clouds.small.target, starts)))
     log.info("the network, started from %d rotations, found %d transforms", len(starts), len(learned))
-    answers = ranked([*answers, *settle(learned, clouds.dense, matching, 4.0, method)])
+    answers = ranked([*answers, *settle(learned, matching, STARTED, method)])
     return examine(least_turned(answers, guess), matching)
 
 
-def settle(answers: list[Answer], dense: Level, matching: Matching, reach: float, method: str) -> list[Answer]:
-    """Refine and score answers, all on the matched clouds, within ``reach`` spacings, and the best on dense ones."""
-    answers = ranked(improve(answers, matching.clouds.surfaces, matching, reach, method))
-    answers = ranked(improve(answers[:CONTENDERS], dense.surfaces, matching, 2.0, method))
+def to_match(clouds: Pyramid) -> Iterator[tuple[Level, int]]:
+    """Clouds, and from how many of their matches to grow sets of agreeing ones."""
+    if not clouds.all_small:
+        yield clouds.small, SEEDS[0]
+    yield clouds.larger, SEEDS[1]
+
+
+def settle(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
+    """Refine and score answers on the matched clouds, within ``reach`` spacings: the best of them, the best first."""
+    answers = ranked(improve(answers, matching, reach, method))[:CONTENDERS]
     log.info("refined and scored: best overlap %.2f, %d others", answers[0].overlap, len(answers) - 1)
     return answers
 

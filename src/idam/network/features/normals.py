@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -108,14 +109,15 @@ def find_neighbours(points: Tensor, *reaches: Reach) -> list[Neighbours]:
 
 def nearest_neighbours_of(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """The ``count`` nearest others of every point (N, 3), fewer in a smaller cloud: distances and rows, (N, K) each."""
-    size = len(points)
-    rows = max(1, DISTANCES // size)
-    found = []
-    for start in range(0, size, rows):
-        distance = torch.cdist(points[start : start + rows], points, compute_mode="donot_use_mm_for_euclid_dist")
-        distance.diagonal(offset=start).fill_(torch.inf)
-        found.append(distance.topk(min(count, size - 1), largest=False))
-    return torch.cat([part.values for part in found]), torch.cat([part.indices for part in found])
+    import small_gicp
+
+    cloud = points.double().cpu().numpy()
+    tree = small_gicp.KdTree(cloud)
+    near, square = tree.batch_knn_search(cloud, min(count + 1, len(cloud)), num_threads=torch.get_num_threads())
+    others = near != np.arange(len(cloud))[:, None]
+    others[others.all(1), -1] = False  # of more copies of a point than asked for, it need not be among the first itself
+    near, square = (x[others].reshape(len(cloud), -1) for x in (near.astype(np.int64), square))
+    return torch.from_numpy(np.sqrt(square)).to(points), torch.from_numpy(near).to(points.device)
 
 
 def among_nearest(distance: Tensor, near: Tensor, reach: Reach) -> Neighbours:

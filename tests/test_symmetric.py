@@ -1,4 +1,4 @@
-"""Fine alignment of few points."""
+"""Fine alignment of few points, which two scans of one surface do not share."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from idam.pyramid import spacing_of
-from idam.refine import Refinable, refine
-from idam.sparse import align_few, symmetric_icp
+from idam.refine import Refinable, refine, refine_few
 from motions import move, rigid
 
 NUDGE = rigid([0.08, -0.06, 0.05], [0.03, -0.04, 0.05])
@@ -39,13 +38,24 @@ def scans(seed: int, noise: float = 0.0) -> tuple[Refinable, Refinable, float]:
     return Refinable.build(source), Refinable.build(target), max(spacing_of(source), spacing_of(target))
 
 
+def symmetric(source: Refinable, target: Refinable, start: np.ndarray, spacing: float) -> np.ndarray:
+    for reach in (2.5, 1.7):
+        start, _ = refine(source, target, start, reach * spacing, "symmetric")
+    return start
+
+
+def few(source: Refinable, target: Refinable, start: np.ndarray, spacing: float) -> np.ndarray:
+    near, _ = refine(source, target, start, 2.5 * spacing, "symmetric")
+    return refine_few(source, target, near, spacing)[0]
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_surfaces_are_laid_on_each_other_better_than_their_points(noise: float) -> None:
     errors = []
     for seed in range(8):
         source, target, spacing = scans(seed, noise)
         found = [
-            align_few(source, target, NUDGE, spacing),
+            few(source, target, NUDGE, spacing),
             refine(source, target, NUDGE, 2 * spacing, "gicp")[0],
             refine(source, target, NUDGE, 2 * spacing, "point", iterations=100)[0],
         ]
@@ -61,25 +71,25 @@ def test_noisy_copies_of_points_are_laid_on_each_other() -> None:
     points, rng = potato(600, 5), np.random.default_rng(5)
     clouds = [Refinable.build(points + 0.008 * rng.normal(size=points.shape)) for _ in range(2)]
     spacing = spacing_of(clouds[0].points)
-    found = align_few(*clouds, NUDGE, spacing)
+    found = few(*clouds, NUDGE, spacing)
     again, _ = refine(*clouds, found, spacing, "point", iterations=100)
     np.testing.assert_allclose(again, found, atol=1e-5)  # the points themselves have the last word
-    assert off(found, np.eye(4))[0] < off(symmetric_icp(*clouds, NUDGE, spacing), np.eye(4))[0]
+    assert off(found, np.eye(4))[0] < off(symmetric(*clouds, NUDGE, spacing), np.eye(4))[0]
 
 
 def test_clouds_that_move_move_the_answer() -> None:
     source, target, spacing = scans(3)
     moved, motion = Refinable.build(move(NUDGE, target.points)), rigid([1.0, -0.5, 0.3], [0.2, 0.1, -0.3])
     turned = Refinable.build(move(motion, source.points))
-    plain = symmetric_icp(source, moved, np.eye(4), spacing)
+    plain = symmetric(source, moved, np.eye(4), spacing)
     start = np.linalg.inv(motion)
-    np.testing.assert_allclose(symmetric_icp(turned, moved, start, spacing) @ motion, plain, atol=1e-4)
+    np.testing.assert_allclose(symmetric(turned, moved, start, spacing) @ motion, plain, atol=1e-4)
 
 
 def test_clouds_exchanged_invert_the_answer() -> None:
     source, target, spacing = scans(4)
-    forth = symmetric_icp(source, target, NUDGE, spacing)
-    back = symmetric_icp(target, source, np.linalg.inv(NUDGE), spacing)
+    forth = symmetric(source, target, NUDGE, spacing)
+    back = symmetric(target, source, np.linalg.inv(NUDGE), spacing)
     degrees, shift = off(back @ forth, np.eye(4))
     assert degrees < 0.1
     assert shift < 0.001
@@ -87,20 +97,31 @@ def test_clouds_exchanged_invert_the_answer() -> None:
 
 def test_what_is_aligned_stays() -> None:
     cloud = Refinable.build(potato(300, 1))
-    np.testing.assert_allclose(align_few(cloud, cloud, np.eye(4), 0.05), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(few(cloud, cloud, np.eye(4), 0.05), np.eye(4), atol=1e-12)
 
 
 def test_clouds_far_apart_keep_the_start() -> None:
     source, target, spacing = scans(2)
     far = rigid([0.1, 0.0, 0.0], [9.0, 0.0, 0.0])
-    np.testing.assert_array_equal(align_few(source, target, far, spacing), far)
+    np.testing.assert_array_equal(few(source, target, far, spacing), far)
 
 
 def test_a_plane_does_not_slide_away() -> None:
     rng = np.random.default_rng(0)
     source, target = (Refinable.build(rng.uniform(-1, 1, size=(300, 3)) * [1, 1, 0]) for _ in range(2))
     start = rigid([0.02, 0.03, 0.0], [0.0, 0.0, 0.03])
-    found = symmetric_icp(source, target, start, 0.06)
+    found = symmetric(source, target, start, 0.06)
     assert abs(found[2, 3]) < 1e-3  # on the plane
     assert np.linalg.norm(found[:2, 3]) < 0.01  # where it was
     np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_information_is_what_small_changes_cost() -> None:
+    source, target, spacing = scans(1)
+    _, information = refine(source, target, np.eye(4), 2 * spacing, "symmetric")
+    np.testing.assert_allclose(information, information.T, atol=1e-9)
+    assert (np.linalg.eigvalsh(information) > 0).all()
+    # a plane: nothing holds a slide along it or a turn in it
+    flat = Refinable.build(np.random.default_rng(0).uniform(-1, 1, size=(300, 3)) * [1, 1, 0])
+    _, held = refine(flat, flat, np.eye(4), 0.1, "symmetric")
+    assert held[[2, 3, 4], [2, 3, 4]].max() < 1e-6 < held[[0, 1, 5], [0, 1, 5]].min()
