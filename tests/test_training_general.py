@@ -63,7 +63,7 @@ def shapes() -> Shapes:
 def small(monkeypatch: pytest.MonkeyPatch, shapes: Shapes) -> None:
     """Six pairs to train on and two to validate on, of scans of some 150 points."""
     monkeypatch.setattr(general, "load", lambda *_: shapes)
-    monkeypatch.setattr(general, "PAIRS", 6)
+    monkeypatch.setattr(general, "PAIRS", {"general": 6, "practice-any-rotation": 6})
     monkeypatch.setattr(general, "VALIDATION_PAIRS", 2)
     monkeypatch.setattr(scans, "DENSE", 15_000)
     monkeypatch.setattr(scans, "COUNTS", (150,) * 4)

@@ -30,8 +30,8 @@ from idam.training.recipe import Recipe
 
 __all__ = ["GeneralStep", "GeneralTask", "MatchLoss", "ScannedPair", "learns_features_alone", "matching_of"]
 
-PAIRS = 4800
-"""Different pairs to train on: drawn once, and then kept, in some 2 GB."""
+PAIRS = {"general": 9600, "practice-any-rotation": 24_000}
+"""Different pairs to train on, by what for: drawn once, and then kept, in some 4 GB."""
 VALIDATION_PAIRS = 100
 HELD = 8
 """One in so many shapes and meshes is held out for validation."""
@@ -177,23 +177,23 @@ class GeneralTask:
         taught, held = (np.arange(len(shapes)) % HELD != 0), (np.arange(len(shapes)) % HELD == 0)
         self.material = Material(shapes[taught], [mesh for n, mesh in enumerate(meshes) if n % HELD])
         self.module = GeneralStep(initial_model(recipe))
-        self.size = PAIRS
+        self.size = PAIRS[recipe.experiment]
         surfaces = f"our own surfaces, ModelNet40's training split and {len(meshes)} meshes"
         if recipe.experiment != "general":
             surfaces = "ModelNet40's training split"
-        self.data = f"{PAIRS} pairs of scans of {surfaces}"
+        self.data = f"{self.size} pairs of scans of {surfaces}"
         self.held = f"{VALIDATION_PAIRS} pairs of scans, an eighth of the shapes and meshes held out for them"
         kept = Material(shapes[held], meshes[::HELD])
         draw = draw_scans if recipe.experiment == "general" else draw_halves
         # of indices that no training reaches, whatever its seed
-        self.pairs = [scanned(draw, kept, VALIDATION_SEED, PAIRS + n) for n in range(VALIDATION_PAIRS)]
+        self.pairs = [scanned(draw, kept, VALIDATION_SEED, self.size + n) for n in range(VALIDATION_PAIRS)]
         self.pair = cache(lambda n: scanned(draw, self.material, recipe.seed, n))
 
     def batch(self, step: int, rank: int, world: int) -> Lesson:
         """Pairs in an order of their own in each epoch, and what their rows are drawn from."""
         size = self.recipe.batch_size
-        epoch, position = divmod(step, PAIRS // size)
-        order = np.random.default_rng((unsigned(self.recipe.seed), epoch)).permutation(PAIRS)
+        epoch, position = divmod(step, self.size // size)
+        order = np.random.default_rng((unsigned(self.recipe.seed), epoch)).permutation(self.size)
         pairs = [self.pair(int(n)) for n in order[position * size : (position + 1) * size][rank::world]]
         return Lesson(pairs, generator_at(self.recipe, step, rank))
 
