@@ -300,6 +300,8 @@ def test_refuses_files(work: Path, call: Call, file: str, words: str) -> None:
         ("--model", "a.safetensors", "a.safetensors"),
         ("--init", "missing.txt", "missing.txt"),
         ("--init", "scaled.txt", "scaled.txt"),
+        ("--max-angle", "0", "max_angle"),
+        ("--max-angle", "far", "--max-angle"),
         ("--voxel-size", "0", "voxel_size"),
         ("--voxel-size", "wide", "--voxel-size"),
         ("--voxel-size", "nan", "voxel_size"),

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 import idam
 from idam import RegistrationResult, registration
 from idam import search as searching
-from idam.confidence import CONVERGED, Evidence, confidence, doubt
+from idam.confidence import CLOSE, CONVERGED, Evidence, confidence, doubt
 from idam.errors import InputError
 from idam.io import PointCloud, write_point_cloud
 from idam.matching import FOR
@@ -174,6 +174,20 @@ def test_runners_up_are_other_transforms_that_score_less() -> None:
         assert not alike(other.transformation, result.transformation)
         # they, too, bring the source to the target
         assert np.linalg.norm(move(other.transformation, source.mean(0)) - move(TRUTH, target.mean(0))) < 0.3
+
+
+def test_an_answer_turns_no_further_than_it_may() -> None:
+    box = trimesh.creation.box((1.2, 0.8, 0.5))
+    source, target = (np.asarray(trimesh.sample.sample_surface(box, 700, seed=seed)[0]) for seed in (1, 2))
+    turn = rigid(Rotation.from_rotvec([0.2, 1.0, -0.3]), [0.1, 0.0, 0.2])
+    half = rigid(Rotation.from_rotvec([0.0, np.pi, 0.0]), [0.0, 0.0, 0.0])
+    for init, expected in ((None, turn), (turn @ half, turn @ half)):
+        result = idam.register(source, move(turn, target), init=init, max_angle=80)
+        assert degrees(result.transformation, expected) < 2
+        assert result.evidence.margin > CLOSE  # its other poses are half turns away
+    # from a guess that far off, nothing else is within reach
+    assert degrees(idam.register(SOURCE, TARGET, max_angle=60).transformation, TRUTH) > 50
+    assert degrees(idam.register(TARGET, SOURCE, max_angle=120).transformation, np.linalg.inv(TRUTH)) < 2
 
 
 @pytest.mark.parametrize(
@@ -600,6 +614,11 @@ def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds(monkeypatch: py
         ("model", "nosuch", "gnn-unseen-shapes"),
         ("model", "", "unknown model"),
         ("model", "nosuch.safetensors", "nosuch.safetensors"),
+        ("max_angle", 0, "max_angle"),
+        ("max_angle", -5.0, "max_angle"),
+        ("max_angle", 181, "max_angle"),
+        ("max_angle", np.nan, "max_angle"),
+        ("max_angle", "any", "max_angle"),
         ("refine", "magic", "gicp, plane, point, symmetric or none"),
         ("refine", ["gicp"], "gicp, plane, point, symmetric or none"),
         ("device", "abacus", "abacus"),

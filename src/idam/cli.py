@@ -82,6 +82,7 @@ def register(
     ] = None,
     model: Annotated[str, typer.Option(help="Name or file of the weights; see 'idam models'.")] = "default",
     init: Annotated[Path | None, typer.Option(help="File of a 4x4 to start from.")] = None,
+    max_angle: Annotated[float, typer.Option(help="Degrees that it turns at most.")] = 180.0,
     voxel_size: Annotated[
         float | None, typer.Option(help="Resolution for the network; from the data if left out.")
     ] = None,
@@ -134,6 +135,7 @@ def register(
             target_cloud,
             model=model,
             init=None if init is None else read_transform(init),
+            max_angle=max_angle,
             voxel_size=voxel_size,
             max_correspondence_distance=max_correspondence_distance,
             refine=refine,

@@ -43,6 +43,7 @@ def register(
     *,
     model: str = "default",
     init: ArrayLike | None = None,
+    max_angle: float = 180.0,
     voxel_size: float | None = None,
     max_correspondence_distance: float | None = None,
     refine: str | None = "gicp",
@@ -56,6 +57,8 @@ def register(
         target: likewise, in the same unit.
         model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them.
         init: (4, 4), a guess of the transform: an answer to consider, and where the network's starts turn around.
+        max_angle: degrees by which the answer turns at most, from the guess where there is one: of a symmetric thing's
+            poses it can rule out all but one. The last refinement may go a little past it.
         voxel_size: of the clouds that matches are sought in, in the input's units; None takes it from the data.
         max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for one and a
             half spacings of the points of the last refinement.
@@ -72,7 +75,7 @@ def register(
             infinity, points all equal or on one line, or an unknown model or option.
     """
     started = time.perf_counter()
-    check_options(voxel_size, max_correspondence_distance, refine, seed)
+    check_options(max_angle, voxel_size, max_correspondence_distance, refine, seed)
     source_points, target_points = (as_points(data, name) for data, name in ((source, "source"), (target, "target")))
     network = cached_model(os.fspath(model), device)
     frame = common_frame(source_points, target_points)
@@ -83,9 +86,9 @@ def register(
     method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
     # always searched in the same direction, so that swapping the clouds inverts the answer
     if smaller_first(*working):
-        found = search(clouds, network, guess, int(seed), method)
+        found = search(clouds, network, guess, int(seed), method, max_angle)
     else:
-        found = search(clouds.swapped(), network, inverse(guess), int(seed), method).inverted()
+        found = search(clouds.swapped(), network, inverse(guess), int(seed), method, max_angle).inverted()
     transformation, information = finish(found.answers[0].transformation, clouds.fine, method)
     full = frame.undo(transformation)
     distance = float(max_correspondence_distance or TOUCHING * clouds.fine.spacing * frame.scale)
@@ -111,8 +114,12 @@ def register(
     )
 
 
-def check_options(voxel_size: float | None, distance: float | None, refine: str | None, seed: int) -> None:
+def check_options(
+    max_angle: float, voxel_size: float | None, distance: float | None, refine: str | None, seed: int
+) -> None:
     """Raise InputError for options out of range."""
+    if not (isinstance(max_angle, Real) and 0 < max_angle <= 180):
+        raise InputError(f"max_angle must be of more than 0 and at most 180 degrees, not {max_angle}")
     for name, value in (("voxel_size", voxel_size), ("max_correspondence_distance", distance)):
         if value is not None and not (isinstance(value, Real) and math.isfinite(value) and value > 0):
             raise InputError(f"{name} must be a positive number, not {value}; leave it out to take it from the data")

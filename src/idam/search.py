@@ -72,7 +72,7 @@ def inverse(transformation: Points) -> Points:
     return np.block([[rotation, -rotation @ transformation[:3, 3:]], [0.0, 0.0, 0.0, 1.0]])
 
 
-def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str) -> Found:
+def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str, max_angle: float = 180.0) -> Found:
     """The answers that explain both clouds best.
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
@@ -85,11 +85,12 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         guess: (4, 4), an answer to consider, around whose rotation the network's starts turn.
         seed: of the starting rotations.
         method: of refinement, or ``none``.
+        max_angle: degrees from the guess past which no transform is looked into.
     """
     candidates = [Answer(guess)]
     for level, seeds in to_match(clouds):
         matching = Matching.of(network, level)
-        agreed = map(Answer, agreeing_transforms(matching.matches, seeds))
+        agreed = within(max_angle, guess, agreeing_transforms(matching.matches, seeds))
         candidates = likeliest(distinct([*candidates, *agreed], HYPOTHESES), matching, EXAMINED)
         answers = settle(candidates, matching, REACH.get(method, 1.0), method)
         found = examine(least_turned(answers, guess), matching)
@@ -103,7 +104,7 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     if isinstance(network.features, Invariant):
         return found
     starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
-    learned = distinct(map(Answer, propose(network, clouds.small.source, clouds.small.target, starts)))
+    learned = distinct(within(max_angle, guess, propose(network, clouds.small.source, clouds.small.target, starts)))
     log.info("the network, started from %d rotations, found %d transforms", len(starts), len(learned))
     answers = ranked([*answers, *settle(learned, matching, STARTED, method)])
     return examine(least_turned(answers, guess), matching)
@@ -114,6 +115,12 @@ def to_match(clouds: Pyramid) -> Iterator[tuple[Level, int]]:
     if not clouds.all_small:
         yield clouds.small, SEEDS[0]
     yield clouds.larger, SEEDS[1]
+
+
+def within(max_angle: float, guess: Points, transformations: list[Points]) -> list[Answer]:
+    """The transforms (4, 4) that turn no further from the guess, in degrees, as answers."""
+    least = 1 + 2 * np.cos(np.radians(max_angle)) - 1e-9  # of the trace, which falls with the angle
+    return [Answer(x) for x in transformations if np.trace(guess[:3, :3].T @ x[:3, :3]) >= least]
 
 
 def settle(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
