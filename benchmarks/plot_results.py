@@ -38,7 +38,8 @@ def read_rows(paths: list[Path]) -> dict[str, Rows]:
 
 def label(row: dict[str, Any]) -> str:
     """The method's name, with the model where it is not the method's own choice."""
-    return f"register ({row['model']})" if row["method"] == "register" and row["model"] else str(row["method"])
+    name = str(row["method"])
+    return f"{name} ({row['model']})" if name.startswith("register") and row["model"] else name
 
 
 def panels(rows: dict[str, Rows], titles: dict[str, str]) -> tuple[Figure, list[tuple[str, Any, list[str]]]]:

@@ -67,8 +67,8 @@ def test_the_network_s_rows_take_the_weights_of_their_experiment(test, built):
 
 
 def test_named_weights_go_to_the_rows_that_take_any(test, built):
-    evaluate(test, ["gnn-idam", "icp", "register"], model="mine")
-    assert [what[1] for what in built[::3]] == ["mine", None, "mine"]
+    evaluate(test, ["gnn-idam", "icp", "register", "register-90"], model="mine")
+    assert [what[1] for what in built[::3]] == ["mine", None, "mine", "mine"]
 
 
 def test_a_finished_row_is_saved_before_the_next_begins(test, built, tmp_path):

@@ -91,7 +91,10 @@ def test_an_unknown_model_is_refused_before_any_pair(name):
 
 
 @pytest.mark.parametrize(("model", "expected"), [(None, "default"), ("another", "another")])
-def test_the_register_row_is_register_with_nothing_set_but_the_model(model, expected, clouds, monkeypatch):
+@pytest.mark.parametrize(("row", "angle"), [("register", 180), ("register-90", 90)])
+def test_register_s_rows_set_nothing_but_the_model_and_the_largest_angle(
+    row, angle, model, expected, clouds, monkeypatch
+):
     calls, answer = [], np.diag([1.0, -1.0, -1.0, 1.0])
 
     def register(*args: object, **options: object) -> SimpleNamespace:
@@ -99,10 +102,10 @@ def test_the_register_row_is_register_with_nothing_set_but_the_model(model, expe
         return SimpleNamespace(transformation=answer)
 
     monkeypatch.setattr(pipeline, "register", register)
-    assert build_method("register", model)(*clouds) is answer
+    assert build_method(row, model)(*clouds) is answer
     ((args, options),) = calls
     assert [a is b for a, b in zip(args, clouds, strict=True)] == [True, True]
-    assert options == {"model": expected}
+    assert options == {"model": expected, "max_angle": angle}
 
 
 def test_the_paper_s_inference_is_a_row_whatever_the_model_s_own(tmp_path, seasoned, clouds, monkeypatch):
@@ -116,7 +119,7 @@ def test_the_paper_s_inference_is_a_row_whatever_the_model_s_own(tmp_path, seaso
     assert (paper.iterations, paper.keep, paper.keep_again, paper.soft_matches) == (3, 1 / 6, (), False)
 
 
-def test_the_register_row_takes_no_settings():
+def test_the_register_row_takes_no_other_settings():
     with pytest.raises(InputError, match="voxel_size=1"):
         build_method("register", None, ["voxel_size=1"])
 

@@ -67,7 +67,8 @@ def evaluate(
 def _weights(method: str, model: str | None, experiment: str) -> str | None:
     """The weights of a row: those named go to every row that takes any."""
     if model is not None:
-        return model if "idam" in method or method in (*ABLATION, *RIVALS, "register") else None
+        takes = "idam" in method or method.startswith("register") or method in (*ABLATION, *RIVALS)
+        return model if takes else None
     return weights_for(method, experiment)
 
 

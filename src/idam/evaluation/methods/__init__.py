@@ -42,8 +42,8 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "fpfh-idam": ("network:fpfh", ()),
     "gnn-idam": ("network:gnn", ()),
     "gnn-idam-icp": ("network:gnn_then_icp", ()),
-    "register": ("pipeline:anyhow", ()),
-    "register-90": ("pipeline:within_a_right_angle", ()),
+    "register": ("pipeline:build", ()),
+    "register-90": ("pipeline:build", ("max_angle=90",)),
     **dict.fromkeys(ABLATION, ("network:ablation", PAPER)),
 }
 """The function that makes each method, in a module beside this one, and the settings of its row."""
