@@ -33,6 +33,7 @@ from idam.search import (
     ranked,
     search,
     settle,
+    within,
 )
 from matchings import as_matches, matching_by, scores_for
 from motions import move, rigid
@@ -302,6 +303,25 @@ def test_without_matches_or_network_the_guess_is_refined(
 def test_a_guess_is_considered_as_it_is(easy: Pyramid, silent: IDAM) -> None:
     found = search(easy, silent, TRUTH, 0, "none")
     np.testing.assert_array_equal(found.answers[0].transformation, TRUTH)
+
+
+def test_nothing_is_looked_into_that_turns_too_far_from_the_guess(
+    easy: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searching, "SURE", 2.0)
+    monkeypatch.setattr(searching, "propose", lambda *_: [TRUTH, WRONG])
+    (answer,) = search(easy, silent, FAR, 0, "none", max_angle=20.0).answers
+    np.testing.assert_array_equal(answer.transformation, FAR)
+    some = rigid([0.0, 0.3, 0.0], [0.0, 0.0, 0.1])
+    found = search(easy, silent, TRUTH @ some, 0, "gicp", max_angle=np.degrees(0.3) + 1)
+    np.testing.assert_allclose(found.answers[0].transformation, TRUTH, atol=0.01)
+
+
+def test_within_counts_from_the_guess() -> None:
+    turns = [rigid([0.0, 0.0, np.radians(degrees)], [0.0, 0.0, 0.1]) for degrees in (0, 30, 60, 90, 180)]
+    kept = within(45.0, turns[2], turns)
+    assert [answer.transformation for answer in kept] == turns[1:4]
+    assert len(within(180.0, turns[2], turns)) == 5
 
 
 def test_a_guess_far_off_does_no_harm(easy: Pyramid, silent: IDAM, found: Found) -> None:

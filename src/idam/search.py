@@ -126,7 +126,7 @@ def within(max_angle: float, guess: Points, transformations: list[Points]) -> li
 def settle(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
     """Refine and score answers on the matched clouds, within ``reach`` spacings: the best of them, the best first."""
     answers = ranked(improve(answers, matching, reach, method))[:CONTENDERS]
-    log.info("refined and scored: best overlap %.2f, %d others", answers[0].overlap, len(answers) - 1)
+    log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
     return answers
 
 

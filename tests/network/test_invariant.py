@@ -21,6 +21,7 @@ from idam.network.features.invariant import (
     pair_features,
     surroundings,
 )
+from idam.network.features.normals import nearest_neighbours_of
 from idam.network.model import IDAM
 
 
@@ -220,3 +221,22 @@ def test_the_network_takes_them_by_name(cloud):
     output = network(cloud[None].float(), cloud[None, :250].float())
     assert output.rotation.isfinite().all()
     assert network.features.rotation_invariant
+
+
+def test_nearest_neighbours_are_those_of_all_distances_and_never_the_point_itself():
+    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points[20:30] = points[20]  # copies, more than are asked for
+    distance, near = nearest_neighbours_of(points, 6)
+    assert near.shape == (60, 6)
+    assert (near != torch.arange(60)[:, None]).all()
+    everything = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
+    torch.testing.assert_close(distance, everything.sort(1).values[:, :6])
+    torch.testing.assert_close(everything.gather(1, near), distance)
+    assert (distance[20:30] == 0).all()
+
+
+def test_a_cloud_smaller_than_asked_for_has_all_others_as_neighbours():
+    distance, near = nearest_neighbours_of(torch.rand(5, 3, generator=torch.Generator().manual_seed(1)), 16)
+    assert near.shape == distance.shape == (5, 4)
+    assert distance.dtype == torch.float32
+    assert [sorted(row) for row in near.tolist()] == [[j for j in range(5) if j != i] for i in range(5)]
