@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from idam.matching import Matching
-from idam.refine import TOUCHING, refine
+from idam.refine import TOUCHING, refine, refine_few
 from idam.scoring import agreement
 
 __all__ = ["Answer", "distinct", "improve", "likeliest"]
@@ -55,7 +55,9 @@ def improve(answers: list[Answer], matching: Matching, reach: float, method: str
     improved = []
     for answer in answers:
         transformation = answer.transformation
-        if method != "none":
+        if method == "symmetric":
+            transformation, _ = refine_few(source, target, transformation, spacing, reach, ITERATIONS)
+        elif method != "none":
             transformation, _ = refine(source, target, transformation, reach * spacing, method, ITERATIONS)
         overlap = agreement(source, target, transformation, TOUCHING * spacing).score
         support = matching.matches.support(transformation)

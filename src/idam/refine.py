@@ -26,7 +26,7 @@ FEW_REACH = 1.7
 """Spacings within which sparse clouds' points pull on each other at last."""
 TOUCHING = 1.5
 """Spacings within which a transform makes two points one."""
-COPIES = 0.75
+COPIES = 0.7
 """Median distance of points that lie on each other, in spacings, below which they are copies of the same points."""
 
 NEIGHBOURS = 15
@@ -119,16 +119,20 @@ def refine(
 
 
 def refine_few(
-    source: Refinable, target: Refinable, start: Points, spacing: float
+    source: Refinable, target: Refinable, start: Points, spacing: float, reach: float = FEW_REACH, iterations: int = 30
 ) -> tuple[Points, NDArray[np.float64]]:
-    """The last refinement of sparse clouds, whose noise and gaps are large: symmetric, as :func:`refine`.
+    """Refine sparse clouds: point to point where their points are copies of each other, else symmetric.
 
-    Where points turn out to be copies of the other cloud's, as in the paper's protocol, they have the last word.
+    In the paper's protocol most points are copies of the other cloud's, and their distance shows it once they are laid
+    on each other. Scans of one surface have no point in common.
+
+    Args and result as of :func:`refine`, but for lengths in spacings.
     """
-    transformation, information = refine(source, target, start, FEW_REACH * spacing, "symmetric")
-    moved = source.points @ transformation[:3, :3].T + transformation[:3, 3]
-    distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
+    points, information = refine(source, target, start, spacing, "point", 100)
+    distance = target.search.query(
+        source.points @ points[:3, :3].T + points[:3, 3], distance_upper_bound=TOUCHING * spacing
+    )[0]
     touching = distance[np.isfinite(distance)]
     if len(touching) and np.median(touching) < COPIES * spacing:
-        return refine(source, target, transformation, spacing, "point", iterations=100)
-    return transformation, information
+        return points, information
+    return refine(source, target, start, reach * spacing, "symmetric", iterations)

@@ -14,7 +14,7 @@ from idam.evaluation.methods import ABLATION, RIVALS, Method
 from idam.evaluation.methods.learned.weights import rival_weights_for
 from idam.network.pretrained import list_models, load_model
 from idam.pyramid import spacing_of
-from idam.refine import Refinable, refine, refine_few
+from idam.refine import Refinable, refine_few
 from idam.settings import with_settings
 
 __all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
@@ -40,7 +40,7 @@ def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
         moving, fixed = (Refinable.build(cloud.astype(np.float64)) for cloud in (source, target))
         spacing = max(spacing_of(cloud.points) for cloud in (moving, fixed))
-        near = refine(moving, fixed, network(source, target), FIRST_REACH * spacing, "symmetric")[0]
+        near = refine_few(moving, fixed, network(source, target), spacing, FIRST_REACH)[0]
         return refine_few(moving, fixed, near, spacing)[0]
 
     return run
