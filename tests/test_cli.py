@@ -234,6 +234,7 @@ def test_options_reach_the_registration(work: Path, call: Call, calls: list[dict
     (work / "init.txt").write_text("0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1\n")
     options = {
         "model": "gnn-unseen-shapes",
+        "max-angle": 75.0,
         "voxel-size": 0.5,
         "max-correspondence-distance": 0.25,
         "refine": "plane",
@@ -247,6 +248,7 @@ def test_options_reach_the_registration(work: Path, call: Call, calls: list[dict
     np.testing.assert_array_equal(given.pop("init"), [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     assert given == {"points": (300, 300), **{name.replace("-", "_"): value for name, value in options.items()}}
     assert (left_out["model"], left_out["refine"], left_out["seed"]) == ("default", "gicp", 0)
+    assert left_out["max_angle"] == 180.0
     assert left_out["init"] is left_out["voxel_size"] is left_out["max_correspondence_distance"] is None
 
 
