@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from idam.errors import InputError
 from idam.symmetric import symmetric_icp
 
-__all__ = ["METHODS", "TOUCHING", "Refinable", "refine", "refine_few"]
+__all__ = ["METHODS", "TOUCHING", "Refinable", "align", "reaches", "refine"]
 
 Points = NDArray[np.float64]
 
@@ -22,8 +22,9 @@ SMALL_GICP = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
 METHODS = (*SMALL_GICP, "symmetric")
 """Fine alignments: generalised ICP, point to plane (as small_gicp has it: each coordinate of the distance times the
 normal's, rather than their inner product), point to point, and symmetric (:mod:`idam.symmetric`)."""
-FEW_REACH = 1.7
-"""Spacings within which sparse clouds' points pull on each other at last."""
+REACHES = {"symmetric": (3.5, 2.5)}
+"""Spacings within which points pull on each other at first and at last, by method; where they are not given, 1, since a
+longer reach draws right answers of little overlap away, and 2."""
 TOUCHING = 1.5
 """Spacings within which a transform makes two points one."""
 COPIES = 0.7
@@ -118,21 +119,40 @@ def refine(
     return transformation, np.asarray(result.H)
 
 
-def refine_few(
-    source: Refinable, target: Refinable, start: Points, spacing: float, reach: float = FEW_REACH, iterations: int = 30
+def reaches(method: str) -> tuple[float, float]:
+    """Spacings within which points pull on each other, at first and at last."""
+    return REACHES.get(method, (1.0, 2.0))
+
+
+def align(
+    source: Refinable,
+    target: Refinable,
+    start: Points,
+    spacing: float,
+    reach: float,
+    method: str,
+    iterations: int = 30,
 ) -> tuple[Points, NDArray[np.float64]]:
-    """Refine sparse clouds: point to point where their points are copies of each other, else symmetric.
+    """:func:`refine` as :func:`idam.register` does it: lengths in spacings, and copies of points laid on each other.
 
     In the paper's protocol most points are copies of the other cloud's, and their distance shows it once they are laid
-    on each other. Scans of one surface have no point in common.
+    on each other, point to point. Scans of one surface have no point in common, and are aligned symmetrically.
 
-    Args and result as of :func:`refine`, but for lengths in spacings.
+    Args and result as of :func:`refine`, but for ``reach`` in spacings, and the method ``none``, which ends where it
+    starts.
     """
-    points, information = refine(source, target, start, spacing, "point", 100)
-    distance = target.search.query(
-        source.points @ points[:3, :3].T + points[:3, 3], distance_upper_bound=TOUCHING * spacing
-    )[0]
+    if method == "none":
+        return start, np.zeros((6, 6))
+    if method == "symmetric":
+        points, information = refine(source, target, start, spacing, "point", 100)
+        if _copies(source, target, points, spacing):
+            return points, information
+    return refine(source, target, start, reach * spacing, method, iterations)
+
+
+def _copies(source: Refinable, target: Refinable, transformation: Points, spacing: float) -> bool:
+    """Whether the source points that a transform lays on the target lie as near as copies do."""
+    moved = source.points @ transformation[:3, :3].T + transformation[:3, 3]
+    distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
     touching = distance[np.isfinite(distance)]
-    if len(touching) and np.median(touching) < COPIES * spacing:
-        return points, information
-    return refine(source, target, start, reach * spacing, "symmetric", iterations)
+    return len(touching) > 0 and bool(np.median(touching) < COPIES * spacing)

@@ -21,8 +21,7 @@ from idam.network.model import IDAM
 from idam.network.pretrained import find, load_model
 from idam.preprocess import Frame, check_points, common_frame, without_strays
 from idam.pyramid import Level, build_pyramid
-from idam.refine import METHODS, TOUCHING, refine_few
-from idam.refine import refine as refine_once
+from idam.refine import METHODS, TOUCHING, align, reaches
 from idam.result import Hypothesis, Matches, RegistrationResult
 from idam.scoring import inliers
 from idam.search import inverse, search
@@ -89,7 +88,10 @@ def register(
         found = search(clouds, network, guess, int(seed), method, max_angle)
     else:
         found = search(clouds.swapped(), network, inverse(guess), int(seed), method, max_angle).inverted()
-    transformation, information = finish(found.answers[0].transformation, clouds.fine, method)
+    fine, (_, reach) = clouds.fine.surfaces, reaches(method)
+    transformation, information = align(
+        fine.source, fine.target, found.answers[0].transformation, clouds.fine.spacing, reach, method
+    )
     full = frame.undo(transformation)
     distance = float(max_correspondence_distance or TOUCHING * clouds.fine.spacing * frame.scale)
     moved = source_points @ full[:3, :3].T + full[:3, 3]
@@ -164,16 +166,6 @@ def smaller_first(source: Points, target: Points) -> bool:
     """Whether the source counts as the smaller cloud: the same whatever the poses, the other when they are swapped."""
     sizes = [(len(points), float(np.linalg.norm(points - points.mean(0)))) for points in (source, target)]
     return sizes[0] <= sizes[1]
-
-
-def finish(transformation: Points, fine: Level, method: str) -> tuple[Points, NDArray[np.float64]]:
-    """The last refinement, on the fine clouds: a working transform (4, 4) and its information matrix (6, 6)."""
-    if method == "none":
-        return transformation, np.zeros((6, 6))
-    surfaces = fine.surfaces
-    if method == "symmetric":
-        return refine_few(surfaces.source, surfaces.target, transformation, fine.spacing)
-    return refine_once(surfaces.source, surfaces.target, transformation, 2.0 * fine.spacing, method)
 
 
 def in_input_units(matches: Matches, frame: Frame) -> Matches:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 
 from idam.confidence import CLOSE, Evidence, confidence
 from idam.consensus import agreeing_transforms
+from idam.copies import told_apart
 from idam.hypotheses import propose, starting_rotations
 from idam.matching import Matching
 from idam.network.features.invariant import Invariant
 from idam.network.model import IDAM
 from idam.pyramid import Level, Pyramid
 from idam.ranking import Answer, distinct, improve, likeliest
+from idam.refine import reaches
 from idam.result import Matches
 
 __all__ = ["Found", "inverse", "search"]
@@ -36,11 +39,8 @@ EXAMINED = 8
 """The likeliest of them, which are refined."""
 CONTENDERS = 6
 """Answers that are kept, and that stay in the race against what larger clouds say."""
-REACH = {"symmetric": 2.5}
-"""Spacings within which points pull on each other, by the method of refinement; 1 for others, which draw right answers
-of little overlap away with a longer reach."""
 STARTED = 4.0
-"""Likewise, after the network."""
+"""Spacings within which points pull on each other after the network."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -92,9 +92,13 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         matching = Matching.of(network, level)
         agreed = within(max_angle, guess, agreeing_transforms(matching.matches, seeds))
         candidates = likeliest(distinct([*candidates, *agreed], HYPOTHESES), matching, EXAMINED)
-        answers = settle(candidates, matching, REACH.get(method, 1.0), method)
+        answers = settle(candidates, matching, reaches(method)[0], method)
         found = examine(least_turned(answers, guess), matching)
         sure = confidence(found.evidence)
+        if sure < SURE and method == "symmetric":
+            answers = told_apart(answers, matching, partial(within, max_angle, guess))
+            found = examine(least_turned(answers, guess), matching)
+            sure = confidence(found.evidence)
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
         )
@@ -117,7 +121,7 @@ def to_match(clouds: Pyramid) -> Iterator[tuple[Level, int]]:
     yield clouds.larger, SEEDS[1]
 
 
-def within(max_angle: float, guess: Points, transformations: list[Points]) -> list[Answer]:
+def within(max_angle: float, guess: Points, transformations: Iterable[Points]) -> list[Answer]:
     """The transforms (4, 4) that turn no further from the guess, in degrees, as answers."""
     least = 1 + 2 * np.cos(np.radians(max_angle)) - 1e-9  # of the trace, which falls with the angle
     return [Answer(x) for x in transformations if np.trace(guess[:3, :3].T @ x[:3, :3]) >= least]

@@ -14,13 +14,10 @@ from idam.evaluation.methods import ABLATION, RIVALS, Method
 from idam.evaluation.methods.learned.weights import rival_weights_for
 from idam.network.pretrained import list_models, load_model
 from idam.pyramid import spacing_of
-from idam.refine import Refinable, refine_few
+from idam.refine import Refinable, align, reaches
 from idam.settings import with_settings
 
 __all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
-
-FIRST_REACH = 2.5
-"""Spacings within which points pull on each other right after the network."""
 
 
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
@@ -40,8 +37,10 @@ def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
         moving, fixed = (Refinable.build(cloud.astype(np.float64)) for cloud in (source, target))
         spacing = max(spacing_of(cloud.points) for cloud in (moving, fixed))
-        near = refine_few(moving, fixed, network(source, target), spacing, FIRST_REACH)[0]
-        return refine_few(moving, fixed, near, spacing)[0]
+        transformation = network(source, target)
+        for reach in reaches("symmetric"):
+            transformation, _ = align(moving, fixed, transformation, spacing, reach, "symmetric")
+        return transformation
 
     return run
 

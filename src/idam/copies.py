@@ -1,0 +1,117 @@
+"""Poses that explain two clouds equally well, told apart by copies of points.
+
+A vase turned about its axis looks the same, and so does a door slid along itself; neither features nor surfaces tell
+one pose from the other. Two clouds that were sampled together, as those of the paper's protocol, still do: most points
+of one are copies of the other's, but for noise, and only the right pose lays points nearer to each other than
+unrelated points of one surface lie. The motions that leave a surface on itself are its slippable ones (Gelfand and
+Guibas, "Shape Segmentation Using Local Slippage Analysis", SGP 2004).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from idam.matching import Matching
+from idam.ranking import Answer, distinct, improve
+from idam.refine import TOUCHING, Refinable
+
+__all__ = ["nearer", "slips", "told_apart"]
+
+Points = NDArray[np.float64]
+
+DECISIVE = 10.0
+"""Nats by which one pose must lay points nearer than another to rule it out."""
+SLIPPABLE = 0.04
+"""Mean square, per mean square of a motion, of what it moves along the normals, below which a surface slips."""
+FARTHEST = 0.5
+"""Working units that a surface is slid at most; what turns is turned all the way round."""
+TRIED = 3
+"""Slipped poses, those that lay points nearest, that are refined."""
+
+
+def told_apart(
+    answers: list[Answer], matching: Matching, within: Callable[[Iterable[Points]], list[Answer]]
+) -> list[Answer]:
+    """The answers, and slipped poses of the first, without those that lay points decidedly farther from each other.
+
+    Args:
+        answers: the best first, refined, on matched clouds that have all points of the input.
+        matching: of these clouds.
+        within: leaves out transforms that turn too far, and makes answers of the others.
+
+    Returns:
+        The answers as they are where none is ruled out; else those that are left, the decided one first.
+    """
+    surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
+    source, target = surfaces.source, surfaces.target
+    slipped = within(slips(source, target, answers[0].transformation, spacing))
+    near = [_together(squares, spacing) for squares in _squares(source, target, slipped, spacing)]
+    chosen = [slipped[n] for n in np.argsort(near)[::-1][:TRIED]]
+    refined = improve([*answers, *chosen], matching, 1.0, "point")
+    squares = _squares(source, target, refined, spacing)
+    best = 0
+    for other in range(1, len(refined)):
+        if nearer(squares[other], squares[best]) > DECISIVE:
+            best = other
+    left = [n for n in range(len(answers)) if n != best and nearer(squares[best], squares[n]) <= DECISIVE]
+    if best == 0 and len(left) == len(answers) - 1:
+        return answers
+    return distinct([refined[best], *(answers[n] for n in left)])
+
+
+def nearer(one: Points, other: Points) -> float:
+    """By how many nats the squared distances (N,) of points laid on each other are less in one pose than in another.
+
+    Of unrelated points of one surface, squared distances are distributed exponentially, by their density alone; this
+    is the logarithm of the likelihoods of one's under either mean. Negative where they are no less, or fewer points are
+    laid on each other.
+    """
+    ratio = one.mean() / max(float(other.mean()), np.finfo(float).tiny) if len(one) and len(other) else 1.0
+    if ratio >= 1.0 or len(one) < 0.8 * len(other):
+        return -1.0
+    return float(len(one) * (ratio - 1 - np.log(max(ratio, np.finfo(float).tiny))))
+
+
+def slips(source: Refinable, target: Refinable, transformation: Points, spacing: float) -> Points:
+    """The transform (4, 4), carried on along each motion that leaves the common surface on itself: (S, 4, 4)."""
+    moved = source.points @ transformation[:3, :3].T + transformation[:3, 3]
+    distance, row = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)
+    on = np.flatnonzero(np.isfinite(distance))
+    if len(on) < 6:
+        return np.empty((0, 4, 4))
+    points, normals = moved[on], target.normals[row[on]]
+    centre = points.mean(0)
+    radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
+    along = np.concatenate([np.cross((points - centre) / radius, normals), normals], 1)
+    share, motions = np.linalg.eigh(along.T @ along / len(on))
+    found = [np.empty((0, 4, 4))]
+    for motion in motions.T[share < SLIPPABLE]:
+        turn, shift = motion[:3] / radius, motion[3:]
+        speed = float(np.linalg.norm(turn))
+        far = np.pi / speed if speed > 1.0 else FARTHEST
+        steps = np.arange(spacing, max(far, 2 * spacing), spacing)
+        twist = np.zeros((4, 4))
+        twist[:3, :3] = np.cross(np.eye(3), turn)
+        twist[:3, 3] = shift - np.cross(turn, centre)
+        found.append(expm(np.concatenate([-steps, steps])[:, None, None] * twist) @ transformation)
+    return np.concatenate(found)
+
+
+def _squares(source: Refinable, target: Refinable, answers: list[Answer], spacing: float) -> list[Points]:
+    """For each answer the squared distances of the source points that it lays on the target."""
+    if not answers:
+        return []
+    transformations = np.stack([answer.transformation for answer in answers])
+    rotation, translation = transformations[:, :3, :3], transformations[:, None, :3, 3]
+    moved = source.points @ rotation.swapaxes(1, 2) + translation
+    distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
+    return [row[np.isfinite(row)] ** 2 for row in distance]
+
+
+def _together(squares: Points, spacing: float) -> float:
+    """How many points lie on each other, and how near."""
+    return float((1 - squares / (TOUCHING * spacing) ** 2).sum())
