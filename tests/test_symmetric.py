@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from idam.pyramid import spacing_of
-from idam.refine import Refinable, refine, refine_few
+from idam.refine import Refinable, align, reaches, refine
+from idam.symmetric import PULL
 from motions import move, rigid
 
 NUDGE = rigid([0.08, -0.06, 0.05], [0.03, -0.04, 0.05])
@@ -39,14 +40,15 @@ def scans(seed: int, noise: float = 0.0) -> tuple[Refinable, Refinable, float]:
 
 
 def symmetric(source: Refinable, target: Refinable, start: np.ndarray, spacing: float) -> np.ndarray:
-    for reach in (2.5, 1.7):
+    for reach in reaches("symmetric"):
         start, _ = refine(source, target, start, reach * spacing, "symmetric")
     return start
 
 
 def few(source: Refinable, target: Refinable, start: np.ndarray, spacing: float) -> np.ndarray:
-    near, _ = refine(source, target, start, 2.5 * spacing, "symmetric")
-    return refine_few(source, target, near, spacing)[0]
+    for reach in reaches("symmetric"):
+        start, _ = align(source, target, start, spacing, reach, "symmetric")
+    return start
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -62,7 +64,7 @@ def test_surfaces_are_laid_on_each_other_better_than_their_points(noise: float) 
         errors.append([off(transformation, np.eye(4)) for transformation in found])
     ours, gicp, point = np.mean(errors, axis=0)
     assert (ours < point).all()
-    assert (ours < 1.2 * gicp).all()  # on so smooth a thing it does nearly as well
+    assert (ours < 1.5 * gicp).all()  # on so smooth a thing it does nearly as well
     assert ours[0] < 2.0
     assert ours[1] < 0.02
 
@@ -112,8 +114,16 @@ def test_a_plane_does_not_slide_away() -> None:
     start = rigid([0.02, 0.03, 0.0], [0.0, 0.0, 0.03])
     found = symmetric(source, target, start, 0.06)
     assert abs(found[2, 3]) < 1e-3  # on the plane
-    assert np.linalg.norm(found[:2, 3]) < 0.01  # where it was
+    assert np.linalg.norm(found[:2, 3]) < 0.06  # within a spacing of where it was
     np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_what_slides_freely_rests_where_points_lie_evenly() -> None:
+    rng = np.random.default_rng(1)
+    source, target = (Refinable.build(rng.uniform(-1, 1, size=(500, 3)) * [1, 1, 0]) for _ in range(2))
+    start = rigid([0.0, 0.0, 0.0], [0.06, -0.04, 0.0])  # a table's top, slid
+    found = symmetric(source, target, start, 0.06)
+    assert np.linalg.norm(found[:2, 3]) < 0.5 * np.linalg.norm(start[:2, 3])
 
 
 def test_information_is_what_small_changes_cost() -> None:
@@ -121,7 +131,8 @@ def test_information_is_what_small_changes_cost() -> None:
     _, information = refine(source, target, np.eye(4), 2 * spacing, "symmetric")
     np.testing.assert_allclose(information, information.T, atol=1e-9)
     assert (np.linalg.eigvalsh(information) > 0).all()
-    # a plane: nothing holds a slide along it or a turn in it
+    # a plane: next to nothing holds a slide along it or a turn in it
     flat = Refinable.build(np.random.default_rng(0).uniform(-1, 1, size=(300, 3)) * [1, 1, 0])
     _, held = refine(flat, flat, np.eye(4), 0.1, "symmetric")
-    assert held[[2, 3, 4], [2, 3, 4]].max() < 1e-6 < held[[0, 1, 5], [0, 1, 5]].min()
+    free, firm = held[[2, 3, 4], [2, 3, 4]], held[[0, 1, 5], [0, 1, 5]]
+    assert (free < 2.1 * PULL * firm[[2, 0, 0]] * [1, 3, 3]).all()

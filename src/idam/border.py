@@ -43,7 +43,8 @@ def mixing(source: Refinable, target: Refinable, transformation: Points, spacing
 
 def _alone(points: Points, other: Refinable, reach: float) -> NDArray[np.bool_]:
     """Which points (N, 3) have none of the other cloud's within reach."""
-    return np.isinf(other.search.query(points, distance_upper_bound=reach)[0])
+    alone: NDArray[np.bool_] = np.isinf(other.search.query(points, distance_upper_bound=reach)[0])
+    return alone
 
 
 def _untold(cloud: Points, others: Points) -> float:
@@ -64,4 +65,4 @@ def _untold(cloud: Points, others: Points) -> float:
 
 
 def _logistic(x: Points) -> Points:
-    return 1 / (1 + np.exp(-x.clip(-7, 7)))
+    return np.asarray(1 / (1 + np.exp(-x.clip(-7, 7))))

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from idam.matching import Matching
-from idam.ranking import Answer, distinct, improve
-from idam.refine import TOUCHING, Refinable
+from idam.ranking import Answer, distinct, scored
+from idam.refine import TOUCHING, Refinable, align
 
 __all__ = ["nearer", "slips", "told_apart"]
 
 Points = NDArray[np.float64]
 
-DECISIVE = 10.0
+DECISIVE = 20.0
 """Nats by which one pose must lay points nearer than another to rule it out."""
 SLIPPABLE = 0.04
 """Mean square, per mean square of a motion, of what it moves along the normals, below which a surface slips."""
@@ -50,17 +50,17 @@ def told_apart(
     source, target = surfaces.source, surfaces.target
     slipped = within(slips(source, target, answers[0].transformation, spacing))
     near = [_together(squares, spacing) for squares in _squares(source, target, slipped, spacing)]
-    chosen = [slipped[n] for n in np.argsort(near)[::-1][:TRIED]]
-    refined = improve([*answers, *chosen], matching, 1.0, "point")
-    squares = _squares(source, target, refined, spacing)
+    starts = [*answers, *(slipped[n] for n in np.argsort(near)[::-1][:TRIED])]
+    poses = [align(source, target, start.transformation, spacing, 1.0, "point")[0] for start in starts]
+    squares = _squares(source, target, list(map(Answer, poses)), spacing)
     best = 0
-    for other in range(1, len(refined)):
+    for other in range(1, len(poses)):
         if nearer(squares[other], squares[best]) > DECISIVE:
             best = other
     left = [n for n in range(len(answers)) if n != best and nearer(squares[best], squares[n]) <= DECISIVE]
     if best == 0 and len(left) == len(answers) - 1:
         return answers
-    return distinct([refined[best], *(answers[n] for n in left)])
+    return distinct([scored(poses[best], matching, sparse=True), *(answers[n] for n in left)])
 
 
 def nearer(one: Points, other: Points) -> float:

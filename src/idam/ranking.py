@@ -14,7 +14,7 @@ from idam.matching import Matching
 from idam.refine import TOUCHING, align
 from idam.scoring import agreement
 
-__all__ = ["Answer", "distinct", "improve", "likeliest"]
+__all__ = ["Answer", "distinct", "improve", "likeliest", "scored"]
 
 Points = NDArray[np.float64]
 
@@ -26,9 +26,9 @@ ITERATIONS = 12
 """Of the refinement before an answer is scored: right ones have come near by then, wrong ones may never."""
 UNLIKELY = 0.05
 """Overlap counts for so much where the features do not speak for an answer: on flat ground they say nothing."""
-MIXED = {"symmetric": 2.0}
-"""How fast an answer's score falls with :func:`idam.border.mixing`, by method of refinement; 0.5 for dense clouds, whose
-features say more, and whose scanner's view does not end at a plane."""
+MIXED = 2.0
+"""How fast the score of sparse clouds' answers falls with :func:`idam.border.mixing`. The features of dense clouds say
+enough, and what a scanner sees of them does not end at a plane."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Answer:
         support: share of the feature matches that it brings together, in [0, 1].
         likelihood: how much likelier the features make it than chance (:meth:`idam.matching.Matching.likelihood`).
         border: 1 where what only one cloud shows lies past where the other ends, less where it lies amid the other
-            (:func:`idam.border.mixing`).
+            (:func:`idam.border.mixing`), of sparse clouds.
     """
 
     transformation: Points
@@ -59,15 +59,21 @@ class Answer:
 def improve(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
     """Each answer refined on the matched clouds, within ``reach`` spacings (with method ``none`` not), and scored."""
     surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
+    aligned = [
+        align(surfaces.source, surfaces.target, answer.transformation, spacing, reach, method, ITERATIONS)[0]
+        for answer in answers
+    ]
+    return [scored(transformation, matching, sparse=method == "symmetric") for transformation in aligned]
+
+
+def scored(transformation: Points, matching: Matching, *, sparse: bool) -> Answer:
+    """A transform (4, 4) with all that speaks for it on the matched clouds."""
+    surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
     source, target = surfaces.source, surfaces.target
-    improved = []
-    for answer in answers:
-        transformation, _ = align(source, target, answer.transformation, spacing, reach, method, ITERATIONS)
-        overlap = agreement(source, target, transformation, TOUCHING * spacing).score
-        support = matching.matches.support(transformation)
-        border = math.exp(-MIXED.get(method, 0.5) * mixing(source, target, transformation, spacing))
-        improved.append(Answer(transformation, overlap, support, matching.likelihood(transformation), border))
-    return improved
+    overlap = agreement(source, target, transformation, TOUCHING * spacing).score
+    border = math.exp(-MIXED * mixing(source, target, transformation, spacing)) if sparse else 1.0
+    support = matching.matches.support(transformation)
+    return Answer(transformation, overlap, support, matching.likelihood(transformation), border)
 
 
 def likeliest(answers: list[Answer], matching: Matching, most: int) -> list[Answer]:

@@ -20,7 +20,7 @@ from idam.io import as_point_cloud, rigid_fault
 from idam.network.model import IDAM
 from idam.network.pretrained import find, load_model
 from idam.preprocess import Frame, check_points, common_frame, without_strays
-from idam.pyramid import Level, build_pyramid
+from idam.pyramid import build_pyramid
 from idam.refine import METHODS, TOUCHING, align, reaches
 from idam.result import Hypothesis, Matches, RegistrationResult
 from idam.scoring import inliers

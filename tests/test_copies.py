@@ -1,0 +1,141 @@
+"""Poses of symmetric things, told apart by copies of points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+import torch
+
+from idam.copies import FARTHEST, nearer, slips, told_apart
+from idam.matching import Matching
+from idam.pyramid import Level, spacing_of
+from idam.ranking import Answer
+from idam.refine import Refinable
+from matchings import matching_by
+from motions import rigid
+
+
+def vase(count: int, seed: int) -> np.ndarray:
+    """Points on a surface of revolution about z."""
+    rng = np.random.default_rng(seed)
+    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.8, 0.8, count)
+    radius = 0.4 + 0.15 * np.cos(4 * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def turned(degrees: float) -> np.ndarray:
+    return rigid([0.0, 0.0, np.radians(degrees)], [0.0, 0.0, 0.0])
+
+
+def degrees_off(answer: Answer) -> float:
+    cosine = (np.trace(answer.transformation[:3, :3]) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def anything(transformations: Iterable[np.ndarray]) -> list[Answer]:
+    return [Answer(x) for x in transformations]
+
+
+def silent(source: np.ndarray, target: np.ndarray) -> Matching:
+    """What features that tell nothing say of two clouds."""
+    spacing = max(spacing_of(source), spacing_of(target))
+    return matching_by(Level(source, target, spacing), torch.zeros(len(source), len(target)))
+
+
+def copies(noise: float = 0.006) -> Matching:
+    """A vase twice, point for point but for noise, its two clouds without opposite fifths."""
+    points, rng = vase(800, 0), np.random.default_rng(9)
+    first, second = (points + noise * rng.normal(size=points.shape) for _ in range(2))
+    return silent(first[first[:, 0] < 0.3], second[second[:, 1] < 0.3])
+
+
+# --- slips ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_surface_of_revolution_slips_round_its_axis() -> None:
+    source, target = Refinable.build(vase(700, 1)), Refinable.build(vase(700, 2))
+    found = slips(source, target, np.eye(4), 0.05)
+    assert len(found) > 30
+    np.testing.assert_allclose(found[:, 2, 2], 1.0, atol=0.02)  # about z
+    np.testing.assert_allclose(
+        found[:, :3, :3] @ found[:, :3, :3].swapaxes(1, 2), np.eye(3)[None].repeat(len(found), 0), atol=1e-9
+    )
+    angle = np.degrees(np.arctan2(found[:, 1, 0], found[:, 0, 0]))
+    assert angle.max() > 165  # all the way round
+    assert angle.min() < -165
+
+
+def test_a_plane_slips_along_itself_and_no_further_than_said() -> None:
+    rng = np.random.default_rng(0)
+    source, target = (Refinable.build(rng.uniform(-1, 1, (600, 3)) * [1, 1, 0]) for _ in range(2))
+    found = slips(source, target, np.eye(4), 0.06)
+    assert np.abs(found[:, 2, 3]).max() < 0.02  # in the plane
+    pure = found[np.abs(found[:, 0, 0] - 1) < 1e-6]
+    assert len(pure) > 4
+    assert np.linalg.norm(pure[:, :3, 3], axis=1).max() <= FARTHEST + 1e-6
+
+
+def test_what_holds_does_not_slip() -> None:
+    rng = np.random.default_rng(0)
+    corner = np.concatenate([np.insert(rng.uniform(0, 1, (200, 2)), axis, 0.0, axis=1) for axis in range(3)])
+    cloud = Refinable.build(corner)
+    assert len(slips(cloud, cloud, np.eye(4), 0.05)) == 0
+
+
+def test_clouds_apart_do_not_slip() -> None:
+    cloud = Refinable.build(vase(300, 1))
+    assert slips(cloud, cloud, rigid([0.0, 0.0, 0.0], [5.0, 0.0, 0.0]), 0.05).shape == (0, 4, 4)
+
+
+# --- nearer --------------------------------------------------------------------------------------------------------
+
+
+def test_nearer_is_a_ratio_of_likelihoods() -> None:
+    rng = np.random.default_rng(0)
+    near, far = rng.exponential(0.5, 300), rng.exponential(1.0, 300)
+
+    def logarithm(squares: np.ndarray, mean: float) -> float:
+        return float((-np.log(mean) - squares / mean).sum())
+
+    assert nearer(near, far) == pytest.approx(logarithm(near, near.mean()) - logarithm(near, far.mean()))
+    assert nearer(far, near) < 0
+    assert nearer(near, near) < 0
+
+
+def test_few_near_points_are_no_evidence_against_many() -> None:
+    assert nearer(np.full(50, 0.1), np.full(300, 1.0)) < 0
+    assert nearer(np.empty(0), np.ones(3)) < 0
+    assert np.isfinite(nearer(np.zeros(10), np.ones(10)))
+    assert np.isfinite(nearer(np.zeros(10), np.zeros(10)))
+
+
+# --- told apart ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [25, 90, -130])
+def test_copies_tell_how_a_vase_is_turned(degrees: float) -> None:
+    found = told_apart([Answer(turned(degrees))], copies(), anything)
+    assert degrees_off(found[0]) < 1.5
+    assert len(found) == 1  # the wrong pose is ruled out
+
+
+def test_copies_choose_among_answers() -> None:
+    flipped = np.diag([1.0, -1.0, -1.0, 1.0])
+    found = told_apart([Answer(flipped, likelihood=1.0), Answer(np.eye(4), likelihood=0.9)], copies(), anything)
+    assert degrees_off(found[0]) < 1.5
+    assert all(degrees_off(answer) < 1.5 for answer in found)
+
+
+def test_scans_without_a_common_point_leave_the_answers_as_they_are() -> None:
+    answers = [Answer(turned(40)), Answer(turned(-70))]
+    assert told_apart(answers, silent(vase(500, 3), vase(500, 4)), anything) == answers
+
+
+def test_no_pose_is_taken_that_turns_too_far() -> None:
+    def none(_: Iterable[np.ndarray]) -> list[Answer]:
+        return []
+
+    answers = [Answer(turned(90))]
+    assert told_apart(answers, copies(), none) == answers
