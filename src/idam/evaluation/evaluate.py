@@ -7,7 +7,7 @@ from pathlib import Path
 
 from idam.errors import InputError, MissingDependencyError
 from idam.evaluation.experiments import TestSet
-from idam.evaluation.methods import ABLATION, RIVALS, rows_of
+from idam.evaluation.methods import has_weights, rows_of
 from idam.evaluation.methods.network import weights_for
 from idam.evaluation.record import Missing, read_rows, write_record
 from idam.evaluation.runner import LIMITS, Row, Task, run
@@ -67,8 +67,7 @@ def evaluate(
 def _weights(method: str, model: str | None, experiment: str) -> str | None:
     """The weights of a row: those named go to every row that takes any."""
     if model is not None:
-        takes = "idam" in method or method.startswith("register") or method in (*ABLATION, *RIVALS)
-        return model if takes else None
+        return model if has_weights(method) else None
     return weights_for(method, experiment)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 
-__all__ = ["ABLATION", "METHODS", "RIVALS", "Method", "build_method", "rows_of"]
+__all__ = ["ABLATION", "METHODS", "RIVALS", "Method", "build_method", "has_weights", "rows_of"]
 
 Method = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float64]]
 """Source (P, 3) and target (Q, 3) to the transform (4, 4) that lays the source on the target."""
@@ -23,6 +23,9 @@ ABLATION = ("ablation-bs", "ablation-sm", "ablation-ha-sm", "ablation-full")
 
 RIVALS = ("pointnetlk", "dcp", "prnet")
 """The learned methods of others, which ``benchmarks/train_rival.py`` trains."""
+
+WITHOUT_WEIGHTS = ("classical", "go_icp", "kiss")
+"""Modules of methods that nothing is learnt for."""
 
 METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "icp": ("classical:icp", ()),
@@ -52,6 +55,11 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
 def rows_of(table: str) -> list[str]:
     """Names of the methods that make up a table."""
     return [name for name in METHODS if (name in ABLATION) == (table == "ablation")]
+
+
+def has_weights(name: str) -> bool:
+    """Whether there is a method of that name, and it takes weights."""
+    return name in METHODS and METHODS[name][0].split(":")[0] not in WITHOUT_WEIGHTS
 
 
 def build_method(name: str, model: str | None = None, settings: Sequence[str] = ()) -> Method:
