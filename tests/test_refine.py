@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from idam.errors import InputError
 from idam.io import read_point_cloud
 from idam.preprocess import Frame, common_frame, downsample
-from idam.refine import METHODS, Refinable, refine
+from idam.refine import METHODS, Refinable, align, reaches, refine
 
 DISTANCE = 0.1
 NUDGE = np.array([0.03, -0.04, 0.05])
@@ -120,3 +120,21 @@ def test_unknown_method(pair: Pair) -> None:
     source, target, truth = pair
     with pytest.raises(InputError, match=r"^unknown refinement 'magic': choose gicp, plane, point, symmetric or none$"):
         refine(source, target, truth, DISTANCE, "magic")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_align_takes_lengths_in_spacings(pair: Pair, method: str) -> None:
+    source, target, truth = pair
+    start = nudged(truth, 2)
+    spacing = DISTANCE / 2
+    found, information = align(source, target, start, spacing, reaches(method)[1], method)
+    assert errors(found, truth)[0] < 0.5 * errors(start, truth)[0]
+    assert np.linalg.eigvalsh(information).min() > 0
+
+
+def test_align_by_no_method_ends_where_it_starts(pair: Pair) -> None:
+    source, target, truth = pair
+    start = nudged(truth, 2)
+    found, information = align(source, target, start, DISTANCE, 2.0, "none")
+    np.testing.assert_array_equal(found, start)
+    assert not information.any()
