@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+import idam
 from idam.copies import FARTHEST, nearer, slips, told_apart
 from idam.matching import Matching
 from idam.pyramid import Level, spacing_of
 from idam.ranking import Answer
 from idam.refine import Refinable
 from matchings import matching_by
-from motions import rigid
+from motions import move, rigid
 
 
 def vase(count: int, seed: int) -> np.ndarray:
@@ -139,3 +140,14 @@ def test_no_pose_is_taken_that_turns_too_far() -> None:
 
     answers = [Answer(turned(90))]
     assert told_apart(answers, copies(), none) == answers
+
+
+def test_register_lays_a_noisy_vase_as_it_stood() -> None:
+    clouds = copies()
+    source, target = clouds.clouds.source, clouds.clouds.target
+    motion = rigid([0.3, -0.2, 1.0], [0.2, 0.1, -0.3])
+    result = idam.register(source, move(motion, target))
+    assert degrees_off(Answer(np.linalg.inv(motion) @ result.transformation)) < 2.0
+    # told that it turns by less than it does, it does not take the right pose, though copies speak for it
+    kept = idam.register(source, move(motion, target), max_angle=30)
+    assert degrees_off(Answer(kept.transformation)) < 40

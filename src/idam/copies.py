@@ -39,7 +39,7 @@ def told_apart(
     """The answers, and slipped poses of the first, without those that lay points decidedly farther from each other.
 
     Args:
-        answers: the best first, refined, on matched clouds that have all points of the input.
+        answers: the best first, refined on the matched clouds, which are to have all points of sparse scans.
         matching: of these clouds.
         within: leaves out transforms that turn too far, and makes answers of the others.
 
