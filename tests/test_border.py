@@ -67,7 +67,7 @@ def test_it_is_the_least_cross_entropy_that_a_plane_has() -> None:
 
         def loss(plane: np.ndarray, inputs: np.ndarray = inputs, labels: np.ndarray = labels) -> float:
             logit = inputs @ plane
-            pull = SHRINK * len(inputs) / 20 * (plane[:3] ** 2).sum()
+            pull = SHRINK * len(inputs) / 2 * (plane[:3] ** 2).sum()
             return float((np.logaddexp(0, logit) - labels * logit).sum() + pull)
 
         logit = inputs @ minimize(loss, np.zeros(4)).x

@@ -21,7 +21,7 @@ ALONE = 2.0
 """Spacings to the nearest point of the other cloud from which on a point is one that the other does not show."""
 STEPS = 10
 """Of Newton's method, which has converged by then."""
-SHRINK = 0.02
+SHRINK = 0.002
 """Pull on the plane's normal per point, so that clouds which a plane divides do not send it to infinity."""
 SHARP = 3.0
 """By how much coordinates in working units are multiplied: about the slope that a border has."""
@@ -54,7 +54,7 @@ def _untold(cloud: Points, others: Points) -> float:
     points = np.concatenate([cloud, others])
     inputs = np.concatenate([SHARP * points, np.ones((len(points), 1))], 1)
     labels = np.arange(len(points)) >= len(cloud)
-    pull = SHRINK * len(points) * np.array([1.0, 1.0, 1.0, 1e-6]) / 10
+    pull = SHRINK * len(points) * np.array([1.0, 1.0, 1.0, 1e-6])
     plane = np.zeros(4)
     for _ in range(STEPS):
         chance = _logistic(inputs @ plane)

@@ -27,7 +27,7 @@ OFF = 0.4
 PULL = 0.05
 """Share of the pull of the whole distance of two points, beside that along their normals."""
 DAMPING = 1e-4
-"""Pull towards no motion, as of so many pairs: what the surface leaves free, as the slide of a plane, stays."""
+"""Pull towards no motion, as of so many pairs, so that there is a step where next to nothing pulls."""
 STILL = 1e-5
 """Length of the step, in radians and working units, from which on it is done."""
 
