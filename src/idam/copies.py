@@ -48,11 +48,11 @@ def told_apart(
     """
     surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
     source, target = surfaces.source, surfaces.target
-    slipped = within(slips(source, target, answers[0].transformation, spacing))
+    slipped = [answer.transformation for answer in within(slips(source, target, answers[0].transformation, spacing))]
     near = [_together(squares, spacing) for squares in _squares(source, target, slipped, spacing)]
-    starts = [*answers, *(slipped[n] for n in np.argsort(near)[::-1][:TRIED])]
-    poses = [align(source, target, start.transformation, spacing, 1.0, "point")[0] for start in starts]
-    squares = _squares(source, target, list(map(Answer, poses)), spacing)
+    starts = [answer.transformation for answer in answers] + [slipped[n] for n in np.argsort(near)[::-1][:TRIED]]
+    poses = [align(source, target, start, spacing, 1.0, "point")[0] for start in starts]
+    squares = _squares(source, target, poses, spacing)
     best = 0
     for other in range(1, len(poses)):
         if nearer(squares[other], squares[best]) > DECISIVE:
@@ -101,12 +101,10 @@ def slips(source: Refinable, target: Refinable, transformation: Points, spacing:
     return np.concatenate(found)
 
 
-def _squares(source: Refinable, target: Refinable, answers: list[Answer], spacing: float) -> list[Points]:
-    """For each answer the squared distances of the source points that it lays on the target."""
-    if not answers:
-        return []
-    transformations = np.stack([answer.transformation for answer in answers])
-    rotation, translation = transformations[:, :3, :3], transformations[:, None, :3, 3]
+def _squares(source: Refinable, target: Refinable, poses: list[Points], spacing: float) -> list[Points]:
+    """For each transform (4, 4) the squared distances of the source points that it lays on the target."""
+    stacked = np.reshape(poses, (-1, 4, 4))
+    rotation, translation = stacked[:, :3, :3], stacked[:, None, :3, 3]
     moved = source.points @ rotation.swapaxes(1, 2) + translation
     distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
     return [row[np.isfinite(row)] ** 2 for row in distance]
