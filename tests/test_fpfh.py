@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 from idam.geometry import apply_transform, random_rotation
 from idam.network.features import fpfh as fpfh_module
-from idam.network.features import normals as normals_module
 from idam.network.features.fpfh import FPFH, estimate_normals, fpfh
+from idam.network.features.normals import Reach, find_neighbours
 
 SHAPES = ["sphere", "torus", "capsule", "box", "plate"]
 TRANSLATION = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
@@ -183,12 +183,24 @@ def test_batch_equals_one_by_one() -> None:
     assert_close(FPFH()(clouds), torch.cat([FPFH()(cloud) for cloud in torch.split(clouds, 1)]), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("distances", [1000, 100_000, 10**9])
-def test_parts_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch, distances: int) -> None:
-    clouds = torch.cat([make_cloud(shape, 200) for shape in SHAPES])
-    expected = FPFH()(clouds)
-    monkeypatch.setattr(normals_module, "DISTANCES", distances)
-    assert_close(FPFH()(clouds), expected, rtol=0, atol=0)
+def test_neighbours_are_those_of_all_distances() -> None:
+    points = make_cloud("box", 300)
+    square = torch.cdist(points[0], points[0], compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
+    for reach in (Reach(0.3, at_most=8), Reach(0.3, at_most=1000), Reach(0.05, at_most=20, at_least=2)):
+        (near,) = find_neighbours(points, reach)
+        for row, distance in enumerate(square):
+            within = int((distance < reach.radius).sum())
+            expected = distance.argsort()[: min(max(within, reach.at_least), reach.at_most)]
+            assert near.neighbour[near.centre == row].tolist() == expected.tolist()
+        assert near.counts.tolist() == near.centre.bincount(minlength=300).tolist()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_points_that_are_no_numbers_are_told(value: float) -> None:
+    points = make_cloud("box", 100)
+    points[0, 3, 1] = value
+    with pytest.raises(ValueError, match="must be finite"):
+        FPFH()(points)
 
 
 def test_module_is_normals_then_features() -> None:

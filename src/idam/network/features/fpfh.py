@@ -29,9 +29,9 @@ from torch import Tensor, nn
 from idam.network.features.normals import (
     Neighbours,
     Reach,
+    cloud_by_cloud,
     estimate_normals,
     find_neighbours,
-    in_parts,
     normal_reach,
     normals_from_neighbours,
 )
@@ -68,7 +68,7 @@ def fpfh(points: Tensor, normals: Tensor, *, radius: float, max_neighbours: int)
     def describe(cloud: Tensor, normal: Tensor) -> Tensor:
         return fpfh_of_neighbours(cloud, normal, *find_neighbours(cloud, reach))
 
-    return in_parts(describe, points, normals)
+    return cloud_by_cloud(describe, points, normals)
 
 
 class FPFH(nn.Module):
@@ -100,7 +100,7 @@ class FPFH(nn.Module):
     @torch.no_grad()
     def forward(self, points: Tensor) -> Tensor:
         """Features (B, N, 33) of ``points`` (B, N, 3): ``fpfh`` with the normals of ``estimate_normals``."""
-        return in_parts(self._describe, points)
+        return cloud_by_cloud(self._describe, points)
 
     def _describe(self, points: Tensor) -> Tensor:
         near_for_normals, near = find_neighbours(points, self.normal_reach, self.feature_reach)

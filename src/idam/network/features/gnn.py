@@ -20,20 +20,25 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from idam.geometry import nearest_neighbours
+from idam.network.features.normals import nearest_neighbours_of
 from idam.network.layers import NormalisedLinear
 
 __all__ = ["GNN", "EdgeLayer", "neighbour_graph"]
 
 
 def neighbour_graph(points: Tensor, k: int) -> Tensor:
-    """The k nearest neighbours of every point of a batch of clouds (B, N, 3).
+    """The k nearest neighbours of every point of a batch of clouds (B, N, 3), by a tree or, on a GPU, by all distances.
 
     Returns:
         (k, P): rows of the flattened batch of P = B N points; each cloud is on its own.
     """
     batch, count, _ = points.shape
     offset = torch.arange(batch, device=points.device).view(-1, 1, 1) * count
-    return (nearest_neighbours(points, k) + offset).view(-1, k).t().contiguous()
+    if points.is_cuda:
+        near = nearest_neighbours(points, k)
+    else:
+        near = torch.stack([nearest_neighbours_of(cloud, k)[1] for cloud in points])
+    return (near + offset).view(-1, k).t().contiguous()
 
 
 class _NeighbourDifference(torch.autograd.Function):

@@ -20,16 +20,14 @@ __all__ = [
     "Neighbours",
     "Reach",
     "among_nearest",
+    "cloud_by_cloud",
     "estimate_normals",
     "find_neighbours",
-    "in_parts",
     "nearest_neighbours_of",
     "normal_reach",
     "normals_from_neighbours",
 ]
 
-# Entries of the largest distance matrix held at a time: bounds memory, and keeps the matrix in the processor's cache.
-DISTANCES = 2**21
 # Points, itself included, that a normal is taken from where the radius holds fewer: any fewer span no plane.
 FEWEST_POINTS = 3
 # A neighbourhood is a line where its second variance is below this fraction of the first. The roots of the closed form
@@ -68,11 +66,11 @@ class Neighbours(NamedTuple):
         return F.embedding_bag(self.neighbour, values, start, mode="sum", per_sample_weights=weight)
 
 
-def in_parts(function: Callable[..., Tensor], points: Tensor, *others: Tensor) -> Tensor:
-    """Apply a function of clouds to a batch of them, so many at a time as memory bounds allow, in float32 or float64.
+def cloud_by_cloud(function: Callable[..., Tensor], points: Tensor, *others: Tensor) -> Tensor:
+    """Apply a function of one cloud to each of a batch of them, in float32 or float64.
 
     Args:
-        function: takes parts (b, N, 3) of ``points`` and ``others``, and returns (b, N, C).
+        function: takes a cloud (1, N, 3) of ``points`` and of each of the ``others``, and returns (1, N, C).
         points: (B, N, 3), of any floating dtype.
         others: more of the same shape.
 
@@ -82,36 +80,29 @@ def in_parts(function: Callable[..., Tensor], points: Tensor, *others: Tensor) -
     if points.dim() != 3 or points.shape[-1] != 3 or points.numel() == 0:
         raise ValueError(f"points must be (B, N, 3), none of them 0, got {tuple(points.shape)}")
     dtype = torch.promote_types(points.dtype, torch.float32)
-    step = max(1, DISTANCES // points.shape[1] ** 2)
-    parts = zip(*(torch.split(clouds, step) for clouds in (points, *others)), strict=True)
-    return torch.cat([function(*(clouds.to(dtype) for clouds in part)) for part in parts]).to(points.dtype)
+    clouds = zip(*(x.to(dtype).split(1) for x in (points, *others)), strict=True)
+    return torch.cat([function(*cloud) for cloud in clouds]).to(points.dtype)
 
 
 def find_neighbours(points: Tensor, *reaches: Reach) -> list[Neighbours]:
-    """Find the neighbours of every point in its own cloud, for each of the ``reaches``.
-
-    Args:
-        points: (B, N, 3), a part of the batch as ``in_parts`` deals them out: one cloud, or several small ones.
-        reaches: the searches to do; they share the distances.
-    """
-    batch, size, _ = points.shape
-    rows = max(1, DISTANCES // (batch * size))  # all of them, unless one cloud alone is too large
-    pairs: list[list[Tensor]] = [[] for _ in reaches]
-    for start in range(0, size, rows):
-        # by differences: the faster way over |a|^2 + |b|^2 - 2 ab cancels, and in TF32 has three digits to begin with
-        part = points[:, start : start + rows]
-        distance = torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist")
-        distance.diagonal(offset=start, dim1=-2, dim2=-1).fill_(torch.inf)
-        for found, reach in zip(pairs, reaches, strict=True):
-            found.append(_select(distance.flatten(0, 1), reach).flatten().nonzero().squeeze(1) + start * size)
-    return [_as_neighbours(torch.cat(found), batch, size) for found in pairs]
+    """The neighbours of every point of a cloud (1, N, 3), for each of the ``reaches``, which share one search."""
+    distance, near = nearest_neighbours_of(points[0], max(reach.at_most for reach in reaches))
+    return [among_nearest(distance, near, reach) for reach in reaches]
 
 
 def nearest_neighbours_of(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The ``count`` nearest others of every point (N, 3), fewer in a smaller cloud: distances and rows, (N, K) each."""
+    """The ``count`` nearest others of every point (N, 3), fewer in a smaller cloud: distances and rows, (N, K) each.
+
+    By a tree, on the CPU: a matrix of all distances takes ten times as long from some thousand points on.
+
+    Raises:
+        ValueError: a coordinate is not finite.
+    """
     import small_gicp
 
-    cloud = points.double().cpu().numpy()
+    cloud = points.detach().double().cpu().numpy()
+    if not np.isfinite(cloud).all():  # a tree of them would crash
+        raise ValueError("points must be finite: leave out NaN and infinity")
     tree = small_gicp.KdTree(cloud)
     near, square = tree.batch_knn_search(cloud, min(count + 1, len(cloud)), num_threads=torch.get_num_threads())
     others = near != np.arange(len(cloud))[:, None]
@@ -127,26 +118,6 @@ def among_nearest(distance: Tensor, near: Tensor, reach: Reach) -> Neighbours:
     chosen[:, reach.at_most :] = False
     centre, column = chosen.nonzero().unbind(1)
     return Neighbours(centre, near[centre, column], chosen.sum(1))
-
-
-def _select(distance: Tensor, reach: Reach) -> Tensor:
-    """Which entries of ``distance`` (P, N) are within reach of their row's point: (P, N) bool."""
-    chosen = distance < reach.radius
-    count = chosen.sum(-1, dtype=torch.int32)
-    at_most, at_least = (min(bound, distance.shape[-1] - 1) for bound in (reach.at_most, reach.at_least))
-    for wrong, k in ((count > at_most, at_most), (count < at_least, at_least)):
-        row = wrong.nonzero().squeeze(1)
-        nearest = distance[row].topk(k, largest=False, sorted=False).indices
-        chosen[row] = False
-        chosen[row.unsqueeze(1), nearest] = True
-    return chosen
-
-
-def _as_neighbours(pair: Tensor, batch: int, size: int) -> Neighbours:
-    """Sorted positions (E,) in the (B, N, N) table of pairs as rows of the clouds laid end to end."""
-    centre = pair // size
-    neighbour = pair - centre * size + centre // size * size
-    return Neighbours(centre, neighbour, torch.bincount(centre, minlength=batch * size))
 
 
 @torch.no_grad()
@@ -172,7 +143,7 @@ def estimate_normals(points: Tensor, *, radius: float, max_neighbours: int) -> T
         Unit normals (B, N, 3), without gradient.
     """
     reach = normal_reach(radius, max_neighbours)
-    return in_parts(lambda cloud: normals_from_neighbours(cloud, *find_neighbours(cloud, reach)), points)
+    return cloud_by_cloud(lambda cloud: normals_from_neighbours(cloud, *find_neighbours(cloud, reach)), points)
 
 
 def normal_reach(radius: float, max_neighbours: int) -> Reach:
