@@ -80,7 +80,7 @@ def cloud_by_cloud(function: Callable[..., Tensor], points: Tensor, *others: Ten
     if points.dim() != 3 or points.shape[-1] != 3 or points.numel() == 0:
         raise ValueError(f"points must be (B, N, 3), none of them 0, got {tuple(points.shape)}")
     dtype = torch.promote_types(points.dtype, torch.float32)
-    clouds = zip(*(x.to(dtype).split(1) for x in (points, *others)), strict=True)
+    clouds = zip(*(torch.split(x.to(dtype), 1) for x in (points, *others)), strict=True)
     return torch.cat([function(*cloud) for cloud in clouds]).to(points.dtype)
 
 
