@@ -19,8 +19,8 @@ from idam.network.layers import NormalisedLinear
 
 __all__ = ["SimilarityConvolution", "pair_geometry"]
 
-PAIRS_IN_CACHE = 32768
-"""Pairs that go through the convolutions at once in evaluation: their features, 4 MB, stay near the cores."""
+PAIRS_IN_CACHE = 16384
+"""Pairs that go through the convolutions at once in evaluation: their features, 2 MB, stay near the cores."""
 
 
 def pair_geometry(source: Tensor, target: Tensor) -> Tensor:
