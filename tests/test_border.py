@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from idam.border import ALONE, SHARP, SHRINK, mixing
-from idam.refine import Refinable
+from idam.refine import Refinable, Surfaces
 from motions import move, rigid
 
 SPACING = 0.05
@@ -21,40 +21,40 @@ def sheet(low: float, high: float, seed: int = 0) -> np.ndarray:
     return np.stack([x, y, 0.1 * np.sin(4 * x)], 1)
 
 
-def cloud(points: np.ndarray) -> Refinable:
-    return Refinable.build(points)
+def pair(source: np.ndarray, target: np.ndarray) -> Surfaces:
+    return Surfaces(Refinable.build(source), Refinable.build(target), SPACING)
 
 
 def test_nothing_alone_is_nothing_mixed() -> None:
-    same = cloud(sheet(-1, 1))
-    assert mixing(same, same, STAY, SPACING) == 0.0
+    same = sheet(-1, 1)
+    assert mixing(pair(same, same), STAY) == 0.0
 
 
 def test_past_the_border_is_better_than_amid() -> None:
     whole = sheet(-1, 1)
-    left = cloud(whole[whole[:, 0] < 0.3])
-    right = cloud(whole[whole[:, 0] > -0.3])
-    beside = mixing(left, right, STAY, SPACING)
+    left = whole[whole[:, 0] < 0.3]
+    right = whole[whole[:, 0] > -0.3]
+    beside = mixing(pair(left, right), STAY)
     # a hole that the other cloud fills: it ought to have been seen
-    holed = cloud(whole[np.abs(whole[:, 0]) > 0.35])
-    amid = mixing(cloud(whole), holed, STAY, SPACING)
+    holed = whole[np.abs(whole[:, 0]) > 0.35]
+    amid = mixing(pair(whole, holed), STAY)
     assert beside < 0.3 < 0.5 < amid
 
 
 def test_a_right_pose_mixes_less_than_one_slid() -> None:
-    source, target = cloud(sheet(-1, 0.3, seed=1)), cloud(sheet(-0.4, 1, seed=2))
+    source, target = sheet(-1, 0.3, seed=1), sheet(-0.4, 1, seed=2)
     slid = rigid([0.0, 0.0, 0.0], [0.2, 0.5, 0.0])  # beside each other along y, where neither ends
-    assert mixing(source, target, STAY, SPACING) < mixing(source, target, slid, SPACING)
+    assert mixing(pair(source, target), STAY) < mixing(pair(source, target), slid)
 
 
 def test_swapping_and_moving_both_change_nothing() -> None:
     source, target = sheet(-1, 0.3, seed=1), sheet(-0.4, 1, seed=2)
     pose, motion = rigid([0.1, 0.2, -0.1], [0.1, 0.1, 0.0]), rigid([1.0, -0.4, 0.2], [0.0, 0.0, 0.0])
-    expected = mixing(cloud(source), cloud(target), pose, SPACING)
-    assert mixing(cloud(target), cloud(source), np.linalg.inv(pose), SPACING) == pytest.approx(expected, abs=1e-9)
+    expected = mixing(pair(source, target), pose)
+    assert mixing(pair(target, source), np.linalg.inv(pose)) == pytest.approx(expected, abs=1e-9)
     # about the origin, for the plane's pull towards flatness knows of it
-    turned = cloud(move(motion, target))
-    assert mixing(cloud(source), turned, motion @ pose, SPACING) == pytest.approx(expected, abs=1e-6)
+    turned = move(motion, target)
+    assert mixing(pair(source, turned), motion @ pose) == pytest.approx(expected, abs=1e-6)
 
 
 def test_it_is_the_least_cross_entropy_that_a_plane_has() -> None:
@@ -72,9 +72,9 @@ def test_it_is_the_least_cross_entropy_that_a_plane_has() -> None:
 
         logit = inputs @ minimize(loss, np.zeros(4)).x
         expected += float((np.logaddexp(0, logit) - labels * logit).mean())
-    assert mixing(cloud(source), cloud(target), STAY, SPACING) == pytest.approx(expected, abs=0.01)
+    assert mixing(pair(source, target), STAY) == pytest.approx(expected, abs=0.01)
 
 
 def test_clouds_that_nowhere_touch_are_told_apart() -> None:
     far = rigid([0.0, 0.0, 0.0], [9.0, 0.0, 0.0])
-    assert np.isfinite(mixing(cloud(sheet(-1, 1)), cloud(sheet(-1, 1, seed=3)), far, SPACING))
+    assert np.isfinite(mixing(pair(sheet(-1, 1), sheet(-1, 1, seed=3)), far))

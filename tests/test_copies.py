@@ -13,7 +13,7 @@ from idam.copies import FARTHEST, nearer, slips, told_apart
 from idam.matching import Matching
 from idam.pyramid import Level, spacing_of
 from idam.ranking import Answer
-from idam.refine import Refinable
+from idam.refine import Refinable, Surfaces
 from matchings import matching_by
 from motions import move, rigid
 
@@ -57,7 +57,7 @@ def copies(noise: float = 0.006) -> Matching:
 
 def test_a_surface_of_revolution_slips_round_its_axis() -> None:
     source, target = Refinable.build(vase(700, 1)), Refinable.build(vase(700, 2))
-    found = slips(source, target, np.eye(4), 0.05)
+    found = slips(Surfaces(source, target, 0.05), np.eye(4))
     assert len(found) > 30
     np.testing.assert_allclose(found[:, 2, 2], 1.0, atol=0.02)  # about z
     np.testing.assert_allclose(
@@ -71,7 +71,7 @@ def test_a_surface_of_revolution_slips_round_its_axis() -> None:
 def test_a_plane_slips_along_itself_and_no_further_than_said() -> None:
     rng = np.random.default_rng(0)
     source, target = (Refinable.build(rng.uniform(-1, 1, (600, 3)) * [1, 1, 0]) for _ in range(2))
-    found = slips(source, target, np.eye(4), 0.06)
+    found = slips(Surfaces(source, target, 0.06), np.eye(4))
     assert np.abs(found[:, 2, 3]).max() < 0.02  # in the plane
     pure = found[np.abs(found[:, 0, 0] - 1) < 1e-6]
     assert len(pure) > 4
@@ -82,12 +82,12 @@ def test_what_holds_does_not_slip() -> None:
     rng = np.random.default_rng(0)
     corner = np.concatenate([np.insert(rng.uniform(0, 1, (200, 2)), axis, 0.0, axis=1) for axis in range(3)])
     cloud = Refinable.build(corner)
-    assert len(slips(cloud, cloud, np.eye(4), 0.05)) == 0
+    assert len(slips(Surfaces(cloud, cloud, 0.05), np.eye(4))) == 0
 
 
 def test_clouds_apart_do_not_slip() -> None:
     cloud = Refinable.build(vase(300, 1))
-    assert slips(cloud, cloud, rigid([0.0, 0.0, 0.0], [5.0, 0.0, 0.0]), 0.05).shape == (0, 4, 4)
+    assert slips(Surfaces(cloud, cloud, 0.05), rigid([0.0, 0.0, 0.0], [5.0, 0.0, 0.0])).shape == (0, 4, 4)
 
 
 # --- nearer --------------------------------------------------------------------------------------------------------

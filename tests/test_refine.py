@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from idam.errors import InputError
 from idam.io import read_point_cloud
 from idam.preprocess import Frame, common_frame, downsample
-from idam.refine import METHODS, Refinable, align, reaches, refine
+from idam.refine import METHODS, Refinable, Surfaces, align, reaches, refine
 
 DISTANCE = 0.1
 NUDGE = np.array([0.03, -0.04, 0.05])
@@ -127,7 +127,7 @@ def test_align_takes_lengths_in_spacings(pair: Pair, method: str) -> None:
     source, target, truth = pair
     start = nudged(truth, 2)
     spacing = DISTANCE / 2
-    found, information = align(source, target, start, spacing, reaches(method)[1], method)
+    found, information = align(Surfaces(source, target, spacing), start, reaches(method)[1], method)
     assert errors(found, truth)[0] < 0.5 * errors(start, truth)[0]
     assert np.linalg.eigvalsh(information).min() > 0
 
@@ -135,6 +135,6 @@ def test_align_takes_lengths_in_spacings(pair: Pair, method: str) -> None:
 def test_align_by_no_method_ends_where_it_starts(pair: Pair) -> None:
     source, target, truth = pair
     start = nudged(truth, 2)
-    found, information = align(source, target, start, DISTANCE, 2.0, "none")
+    found, information = align(Surfaces(source, target, DISTANCE), start, 2.0, "none")
     np.testing.assert_array_equal(found, start)
     assert not information.any()

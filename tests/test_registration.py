@@ -26,7 +26,7 @@ from idam.matching import FOR
 from idam.network.pretrained import find
 from idam.preprocess import common_frame
 from idam.ranking import alike
-from idam.refine import METHODS, Refinable
+from idam.refine import METHODS, Surfaces
 from idam.registration import as_rigid, in_input_units, smaller_first
 from idam.result import Matches
 from motions import move
@@ -472,8 +472,8 @@ def test_refinements(refine: str) -> None:
 def test_last_refinement_takes_the_fine_clouds(refine: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = []
 
-    def noted(source: Refinable, target: Refinable, start: np.ndarray, *rest: Any) -> tuple[np.ndarray, np.ndarray]:
-        taken.append((len(source.points), len(target.points), rest[-1]))
+    def noted(surfaces: Surfaces, start: np.ndarray, *rest: Any) -> tuple[np.ndarray, np.ndarray]:
+        taken.append((len(surfaces.source.points), len(surfaces.target.points), rest[-1]))
         return start, np.zeros((6, 6))
 
     monkeypatch.setattr("idam.registration.align", noted)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from idam.pyramid import spacing_of
-from idam.refine import Refinable, align, reaches, refine
+from idam.refine import Refinable, Surfaces, align, reaches, refine
 from idam.symmetric import PULL
 from motions import move, rigid
 
@@ -47,7 +47,7 @@ def symmetric(source: Refinable, target: Refinable, start: np.ndarray, spacing: 
 
 def few(source: Refinable, target: Refinable, start: np.ndarray, spacing: float) -> np.ndarray:
     for reach in reaches("symmetric"):
-        start, _ = align(source, target, start, spacing, reach, "symmetric")
+        start, _ = align(Surfaces(source, target, spacing), start, reach, "symmetric")
     return start
 
 

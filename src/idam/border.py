@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.refine import Refinable
+from idam.refine import Refinable, Surfaces
 
 __all__ = ["mixing"]
 
@@ -27,15 +27,16 @@ SHARP = 3.0
 """By how much coordinates in working units are multiplied: about the slope that a border has."""
 
 
-def mixing(source: Refinable, target: Refinable, transformation: Points, spacing: float) -> float:
+def mixing(surfaces: Surfaces, transformation: Points) -> float:
     """How far what only one cloud shows is mixed with the other cloud, under a transform (4, 4); 0 for not at all.
 
     For either cloud, a plane tells its points from those of the other that lie on none of them, as well as a plane can
     (a logistic regression); the sum of both cross-entropies, in nats a point, is the answer. Swapping changes nothing.
     """
+    source, target = surfaces.source, surfaces.target
     rotation, translation = transformation[:3, :3], transformation[:3, 3]
     moved, back = source.points @ rotation.T + translation, (target.points - translation) @ rotation
-    reach = ALONE * spacing
+    reach = ALONE * surfaces.spacing
     return _untold(target.points, moved[_alone(moved, target, reach)]) + _untold(
         source.points, back[_alone(back, source, reach)]
     )

@@ -17,7 +17,7 @@ from scipy.linalg import expm
 
 from idam.matching import Matching
 from idam.ranking import Answer, distinct, scored
-from idam.refine import TOUCHING, Refinable, align
+from idam.refine import TOUCHING, Surfaces, align
 
 __all__ = ["nearer", "slips", "told_apart"]
 
@@ -46,13 +46,12 @@ def told_apart(
     Returns:
         The answers as they are where none is ruled out; else those that are left, the decided one first.
     """
-    surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
-    source, target = surfaces.source, surfaces.target
-    slipped = [answer.transformation for answer in within(slips(source, target, answers[0].transformation, spacing))]
-    near = [_together(squares, spacing) for squares in _squares(source, target, slipped, spacing)]
+    surfaces = matching.clouds.surfaces
+    slipped = [answer.transformation for answer in within(slips(surfaces, answers[0].transformation))]
+    near = [_together(squares, surfaces.spacing) for squares in _squares(surfaces, slipped)]
     starts = [answer.transformation for answer in answers] + [slipped[n] for n in np.argsort(near)[::-1][:TRIED]]
-    poses = [align(source, target, start, spacing, 1.0, "point")[0] for start in starts]
-    squares = _squares(source, target, poses, spacing)
+    poses = [align(surfaces, start, 1.0, "point")[0] for start in starts]
+    squares = _squares(surfaces, poses)
     best = 0
     for other in range(1, len(poses)):
         if nearer(squares[other], squares[best]) > DECISIVE:
@@ -76,14 +75,14 @@ def nearer(one: Points, other: Points) -> float:
     return float(len(one) * (ratio - 1 - np.log(max(ratio, np.finfo(float).tiny))))
 
 
-def slips(source: Refinable, target: Refinable, transformation: Points, spacing: float) -> Points:
+def slips(surfaces: Surfaces, transformation: Points) -> Points:
     """The transform (4, 4), carried on along each motion that leaves the common surface on itself: (S, 4, 4)."""
-    moved = source.points @ transformation[:3, :3].T + transformation[:3, 3]
-    distance, row = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)
+    distance, row = surfaces.to_target(transformation)
     on = np.flatnonzero(np.isfinite(distance))
     if len(on) < 6:
         return np.empty((0, 4, 4))
-    points, normals = moved[on], target.normals[row[on]]
+    points = surfaces.source.points[on] @ transformation[:3, :3].T + transformation[:3, 3]
+    normals = surfaces.target.normals[row[on]]
     centre = points.mean(0)
     radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
     along = np.concatenate([np.cross((points - centre) / radius, normals), normals], 1)
@@ -93,7 +92,7 @@ def slips(source: Refinable, target: Refinable, transformation: Points, spacing:
         turn, shift = motion[:3] / radius, motion[3:]
         speed = float(np.linalg.norm(turn))
         far = np.pi / speed if speed > 1.0 else FARTHEST
-        steps = np.arange(spacing, max(far, 2 * spacing), spacing)
+        steps = np.arange(surfaces.spacing, max(far, 2 * surfaces.spacing), surfaces.spacing)
         twist = np.zeros((4, 4))
         twist[:3, :3] = np.cross(np.eye(3), turn)
         twist[:3, 3] = shift - np.cross(turn, centre)
@@ -101,12 +100,9 @@ def slips(source: Refinable, target: Refinable, transformation: Points, spacing:
     return np.concatenate(found)
 
 
-def _squares(source: Refinable, target: Refinable, poses: list[Points], spacing: float) -> list[Points]:
+def _squares(surfaces: Surfaces, poses: list[Points]) -> list[Points]:
     """For each transform (4, 4) the squared distances of the source points that it lays on the target."""
-    stacked = np.reshape(poses, (-1, 4, 4))
-    rotation, translation = stacked[:, :3, :3], stacked[:, None, :3, 3]
-    moved = source.points @ rotation.swapaxes(1, 2) + translation
-    distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
+    distance, _ = surfaces.to_target(np.reshape(poses, (-1, 4, 4)))
     return [row[np.isfinite(row)] ** 2 for row in distance]
 
 

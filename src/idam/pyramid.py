@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from idam.errors import InputError
 from idam.preprocess import MIN_POINTS, choose_voxel_size, downsample
-from idam.refine import Refinable
+from idam.refine import Refinable, Surfaces
 
-__all__ = ["Level", "Pyramid", "Surfaces", "build_pyramid", "level", "spacing_of"]
+__all__ = ["Level", "Pyramid", "build_pyramid", "level", "spacing_of"]
 
 Points = NDArray[np.float64]
 
@@ -32,14 +32,6 @@ FINEST = 1e-4
 
 
 @dataclass(frozen=True)
-class Surfaces:
-    """Both clouds at one resolution, ready for refinement."""
-
-    source: Refinable
-    target: Refinable
-
-
-@dataclass(frozen=True)
 class Level:
     """Both clouds at one resolution, in working coordinates, and the spacing of their points."""
 
@@ -50,7 +42,7 @@ class Level:
     @cached_property
     def surfaces(self) -> Surfaces:
         """The clouds with normals, ready for refinement."""
-        return Surfaces(Refinable.build(self.source), Refinable.build(self.target))
+        return Surfaces(Refinable.build(self.source), Refinable.build(self.target), self.spacing)
 
     @property
     def size(self) -> int:

@@ -58,20 +58,16 @@ class Answer:
 
 def improve(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
     """Each answer refined on the matched clouds, within ``reach`` spacings (with method ``none`` not), and scored."""
-    surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
-    aligned = [
-        align(surfaces.source, surfaces.target, answer.transformation, spacing, reach, method, ITERATIONS)[0]
-        for answer in answers
-    ]
+    surfaces = matching.clouds.surfaces
+    aligned = [align(surfaces, answer.transformation, reach, method, ITERATIONS)[0] for answer in answers]
     return [scored(transformation, matching, sparse=method == "symmetric") for transformation in aligned]
 
 
 def scored(transformation: Points, matching: Matching, *, sparse: bool) -> Answer:
     """A transform (4, 4) with all that speaks for it on the matched clouds."""
-    surfaces, spacing = matching.clouds.surfaces, matching.clouds.spacing
-    source, target = surfaces.source, surfaces.target
-    overlap = agreement(source, target, transformation, TOUCHING * spacing).score
-    border = math.exp(-MIXED * mixing(source, target, transformation, spacing)) if sparse else 1.0
+    surfaces = matching.clouds.surfaces
+    overlap = agreement(surfaces.source, surfaces.target, transformation, TOUCHING * surfaces.spacing).score
+    border = math.exp(-MIXED * mixing(surfaces, transformation)) if sparse else 1.0
     support = matching.matches.support(transformation)
     return Answer(transformation, overlap, support, matching.likelihood(transformation), border)
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from idam.errors import InputError
 from idam.symmetric import symmetric_icp
 
-__all__ = ["METHODS", "TOUCHING", "Refinable", "align", "reaches", "refine"]
+__all__ = ["METHODS", "TOUCHING", "Refinable", "Surfaces", "align", "reaches", "refine"]
 
 Points = NDArray[np.float64]
 
@@ -75,6 +75,26 @@ class Refinable:
         return cKDTree(self.points)
 
 
+@dataclass(frozen=True)
+class Surfaces:
+    """Two clouds to be laid on each other, in working coordinates, and the spacing of their points."""
+
+    source: Refinable
+    target: Refinable
+    spacing: float
+
+    def to_target(self, transformation: Points) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """What the source's N points lie on under a transform (..., 4, 4).
+
+        Returns:
+            The distance (..., N) to the nearest target point, infinite past :data:`TOUCHING` spacings, and its row.
+        """
+        rotation, translation = transformation[..., :3, :3], transformation[..., None, :3, 3]
+        moved = self.source.points @ rotation.swapaxes(-1, -2) + translation
+        distance, row = self.target.search.query(moved, distance_upper_bound=TOUCHING * self.spacing)
+        return distance, row
+
+
 def refine(
     source: Refinable, target: Refinable, start: Points, distance: float, method: str = "gicp", iterations: int = 30
 ) -> tuple[Points, NDArray[np.float64]]:
@@ -125,34 +145,27 @@ def reaches(method: str) -> tuple[float, float]:
 
 
 def align(
-    source: Refinable,
-    target: Refinable,
-    start: Points,
-    spacing: float,
-    reach: float,
-    method: str,
-    iterations: int = 30,
+    surfaces: Surfaces, start: Points, reach: float, method: str, iterations: int = 30
 ) -> tuple[Points, NDArray[np.float64]]:
     """:func:`refine` as :func:`idam.register` does it: lengths in spacings, and copies of points laid on each other.
 
     In the paper's protocol most points are copies of the other cloud's, and their distance shows it once they are laid
     on each other, point to point. Scans of one surface have no point in common, and are aligned symmetrically.
 
-    Args and result as of :func:`refine`, but for ``reach`` in spacings, and the method ``none``, which ends where it
-    starts.
+    Args and result as of :func:`refine`, but for ``reach``, the distance in spacings, and the method ``none``, which
+    ends where it starts.
     """
     if method == "none":
         return start, np.zeros((6, 6))
     if method == "symmetric":
-        points, information = refine(source, target, start, spacing, "point", 100)
-        if _copies(source, target, points, spacing):
+        points, information = refine(surfaces.source, surfaces.target, start, surfaces.spacing, "point", 100)
+        if _copies(surfaces, points):
             return points, information
-    return refine(source, target, start, reach * spacing, method, iterations)
+    return refine(surfaces.source, surfaces.target, start, reach * surfaces.spacing, method, iterations)
 
 
-def _copies(source: Refinable, target: Refinable, transformation: Points, spacing: float) -> bool:
+def _copies(surfaces: Surfaces, transformation: Points) -> bool:
     """Whether the source points that a transform lays on the target lie as near as copies do."""
-    moved = source.points @ transformation[:3, :3].T + transformation[:3, 3]
-    distance = target.search.query(moved, distance_upper_bound=TOUCHING * spacing)[0]
+    distance, _ = surfaces.to_target(transformation)
     touching = distance[np.isfinite(distance)]
-    return len(touching) > 0 and bool(np.median(touching) < COPIES * spacing)
+    return len(touching) > 0 and bool(np.median(touching) < COPIES * surfaces.spacing)

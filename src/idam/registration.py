@@ -90,10 +90,7 @@ def register(
         found = search(clouds.swapped(), network, inverse(guess), int(seed), method, max_angle).inverted()
     transformation, information = found.answers[0].transformation, np.zeros((6, 6))
     if method != "none":  # nor are normals of the fine clouds needed
-        fine, (_, reach) = clouds.fine.surfaces, reaches(method)
-        transformation, information = align(
-            fine.source, fine.target, transformation, clouds.fine.spacing, reach, method
-        )
+        transformation, information = align(clouds.fine.surfaces, transformation, reaches(method)[1], method)
     full = frame.undo(transformation)
     distance = float(max_correspondence_distance or TOUCHING * clouds.fine.spacing * frame.scale)
     moved = source_points @ full[:3, :3].T + full[:3, 3]

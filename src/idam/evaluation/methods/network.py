@@ -14,7 +14,7 @@ from idam.evaluation.methods import ABLATION, RIVALS, Method
 from idam.evaluation.methods.learned.weights import rival_weights_for
 from idam.network.pretrained import list_models, load_model
 from idam.pyramid import spacing_of
-from idam.refine import Refinable, align, reaches
+from idam.refine import Refinable, Surfaces, align, reaches
 from idam.settings import with_settings
 
 __all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
@@ -36,10 +36,10 @@ def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
 
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
         moving, fixed = (Refinable.build(cloud.astype(np.float64)) for cloud in (source, target))
-        spacing = max(spacing_of(cloud.points) for cloud in (moving, fixed))
+        surfaces = Surfaces(moving, fixed, max(spacing_of(cloud.points) for cloud in (moving, fixed)))
         transformation = network(source, target)
         for reach in reaches("symmetric"):
-            transformation, _ = align(moving, fixed, transformation, spacing, reach, "symmetric")
+            transformation, _ = align(surfaces, transformation, reach, "symmetric")
         return transformation
 
     return run
