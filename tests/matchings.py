@@ -55,3 +55,11 @@ def bumpy(count: int, seed: int) -> np.ndarray:
     waves = np.sin(5 * points @ np.array([0.6, 0.0, 0.8])) + np.cos(4 * points @ np.array([0.0, 1.0, 0.3]))
     bumps: np.ndarray = points * [1.0, 0.6, 0.4] * (0.8 + 0.15 * waves[:, None]) + 0.2 * np.maximum(points, 0)
     return bumps
+
+
+def vase(count: int, seed: int) -> np.ndarray:
+    """Points on a surface of revolution about z."""
+    rng = np.random.default_rng(seed)
+    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.8, 0.8, count)
+    radius = 0.4 + 0.15 * np.cos(4 * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)

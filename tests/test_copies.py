@@ -9,21 +9,12 @@ import pytest
 import torch
 
 import idam
-from idam.copies import FARTHEST, nearer, slips, told_apart
+from idam.copies import nearer, told_apart
 from idam.matching import Matching
 from idam.pyramid import Level, spacing_of
 from idam.ranking import Answer
-from idam.refine import Refinable, Surfaces
-from matchings import matching_by
+from matchings import matching_by, vase
 from motions import move, rigid
-
-
-def vase(count: int, seed: int) -> np.ndarray:
-    """Points on a surface of revolution about z."""
-    rng = np.random.default_rng(seed)
-    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.8, 0.8, count)
-    radius = 0.4 + 0.15 * np.cos(4 * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
 
 
 def turned(degrees: float) -> np.ndarray:
@@ -50,44 +41,6 @@ def copies(noise: float = 0.006) -> Matching:
     points, rng = vase(800, 0), np.random.default_rng(9)
     first, second = (points + noise * rng.normal(size=points.shape) for _ in range(2))
     return silent(first[first[:, 0] < 0.3], second[second[:, 1] < 0.3])
-
-
-# --- slips ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_surface_of_revolution_slips_round_its_axis() -> None:
-    source, target = Refinable.build(vase(700, 1)), Refinable.build(vase(700, 2))
-    found = slips(Surfaces(source, target, 0.05), np.eye(4))
-    assert len(found) > 30
-    np.testing.assert_allclose(found[:, 2, 2], 1.0, atol=0.02)  # about z
-    np.testing.assert_allclose(
-        found[:, :3, :3] @ found[:, :3, :3].swapaxes(1, 2), np.eye(3)[None].repeat(len(found), 0), atol=1e-9
-    )
-    angle = np.degrees(np.arctan2(found[:, 1, 0], found[:, 0, 0]))
-    assert angle.max() > 165  # all the way round
-    assert angle.min() < -165
-
-
-def test_a_plane_slips_along_itself_and_no_further_than_said() -> None:
-    rng = np.random.default_rng(0)
-    source, target = (Refinable.build(rng.uniform(-1, 1, (600, 3)) * [1, 1, 0]) for _ in range(2))
-    found = slips(Surfaces(source, target, 0.06), np.eye(4))
-    assert np.abs(found[:, 2, 3]).max() < 0.02  # in the plane
-    pure = found[np.abs(found[:, 0, 0] - 1) < 1e-6]
-    assert len(pure) > 4
-    assert np.linalg.norm(pure[:, :3, 3], axis=1).max() <= FARTHEST + 1e-6
-
-
-def test_what_holds_does_not_slip() -> None:
-    rng = np.random.default_rng(0)
-    corner = np.concatenate([np.insert(rng.uniform(0, 1, (200, 2)), axis, 0.0, axis=1) for axis in range(3)])
-    cloud = Refinable.build(corner)
-    assert len(slips(Surfaces(cloud, cloud, 0.05), np.eye(4))) == 0
-
-
-def test_clouds_apart_do_not_slip() -> None:
-    cloud = Refinable.build(vase(300, 1))
-    assert slips(Surfaces(cloud, cloud, 0.05), rigid([0.0, 0.0, 0.0], [5.0, 0.0, 0.0])).shape == (0, 4, 4)
 
 
 # --- nearer --------------------------------------------------------------------------------------------------------

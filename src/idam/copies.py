@@ -3,8 +3,7 @@
 A vase turned about its axis looks the same, and so does a door slid along itself; neither features nor surfaces tell
 one pose from the other. Two clouds that were sampled together, as those of the paper's protocol, still do: most points
 of one are copies of the other's, but for noise, and only the right pose lays points nearer to each other than
-unrelated points of one surface lie. The motions that leave a surface on itself are its slippable ones (Gelfand and
-Guibas, "Shape Segmentation Using Local Slippage Analysis", SGP 2004).
+unrelated points of one surface lie.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from idam.matching import Matching
 from idam.ranking import Answer, distinct, scored
 from idam.refine import TOUCHING, Surfaces, align
+from idam.slippage import slips
 
-__all__ = ["nearer", "slips", "told_apart"]
+__all__ = ["nearer", "told_apart"]
 
 Points = NDArray[np.float64]
 
@@ -27,8 +26,6 @@ DECISIVE = 20.0
 """Nats by which one pose must lay points nearer than another to rule it out."""
 SLIPPABLE = 0.04
 """Mean square, per mean square of a motion, of what it moves along the normals, below which a surface slips."""
-FARTHEST = 0.5
-"""Working units that a surface is slid at most; what turns is turned all the way round."""
 TRIED = 3
 """Slipped poses, those that lay points nearest, that are refined."""
 
@@ -47,7 +44,7 @@ def told_apart(
         The answers as they are where none is ruled out; else those that are left, the decided one first.
     """
     surfaces = matching.clouds.surfaces
-    slipped = [answer.transformation for answer in within(slips(surfaces, answers[0].transformation))]
+    slipped = [answer.transformation for answer in within(slips(surfaces, answers[0].transformation, SLIPPABLE))]
     near = [_together(squares, surfaces.spacing) for squares in _squares(surfaces, slipped)]
     starts = [answer.transformation for answer in answers] + [slipped[n] for n in np.argsort(near)[::-1][:TRIED]]
     poses = [align(surfaces, start, 1.0, "point")[0] for start in starts]
@@ -73,31 +70,6 @@ def nearer(one: Points, other: Points) -> float:
     if ratio >= 1.0 or len(one) < 0.8 * len(other):
         return -1.0
     return float(len(one) * (ratio - 1 - np.log(max(ratio, np.finfo(float).tiny))))
-
-
-def slips(surfaces: Surfaces, transformation: Points) -> Points:
-    """The transform (4, 4), carried on along each motion that leaves the common surface on itself: (S, 4, 4)."""
-    distance, row = surfaces.to_target(transformation)
-    on = np.flatnonzero(np.isfinite(distance))
-    if len(on) < 6:
-        return np.empty((0, 4, 4))
-    points = surfaces.source.points[on] @ transformation[:3, :3].T + transformation[:3, 3]
-    normals = surfaces.target.normals[row[on]]
-    centre = points.mean(0)
-    radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
-    along = np.concatenate([np.cross((points - centre) / radius, normals), normals], 1)
-    share, motions = np.linalg.eigh(along.T @ along / len(on))
-    found = [np.empty((0, 4, 4))]
-    for motion in motions.T[share < SLIPPABLE]:
-        turn, shift = motion[:3] / radius, motion[3:]
-        speed = float(np.linalg.norm(turn))
-        far = np.pi / speed if speed > 1.0 else FARTHEST
-        steps = np.arange(surfaces.spacing, max(far, 2 * surfaces.spacing), surfaces.spacing)
-        twist = np.zeros((4, 4))
-        twist[:3, :3] = np.cross(np.eye(3), turn)
-        twist[:3, 3] = shift - np.cross(turn, centre)
-        found.append(expm(np.concatenate([-steps, steps])[:, None, None] * twist) @ transformation)
-    return np.concatenate(found)
 
 
 def _squares(surfaces: Surfaces, poses: list[Points]) -> list[Points]:

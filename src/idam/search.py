@@ -22,6 +22,7 @@ from idam.pyramid import Level, Pyramid
 from idam.ranking import Answer, distinct, improve, likeliest
 from idam.refine import reaches
 from idam.result import Matches
+from idam.slippage import slid
 
 __all__ = ["Found", "inverse", "search"]
 
@@ -92,13 +93,13 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         matching = Matching.of(network, level)
         agreed = within(max_angle, guess, agreeing_transforms(matching.matches, seeds))
         candidates = likeliest(distinct([*candidates, *agreed], HYPOTHESES), matching, EXAMINED)
-        answers = settle(candidates, matching, reaches(method)[0], method)
-        found = examine(least_turned(answers, guess), matching)
+        answers = least_turned(settle(candidates, matching, reaches(method)[0], method), guess)
+        found = examine(answers, matching)
+        if confidence(found.evidence) < SURE and method == "symmetric":
+            near = partial(within, max_angle, guess)
+            answers = told_apart(slid(answers, matching, near, method), matching, near)
+            found = examine(answers, matching)
         sure = confidence(found.evidence)
-        if sure < SURE and method == "symmetric":
-            answers = told_apart(answers, matching, partial(within, max_angle, guess))
-            found = examine(least_turned(answers, guess), matching)
-            sure = confidence(found.evidence)
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
         )
