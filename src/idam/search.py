@@ -95,11 +95,12 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         candidates = likeliest(distinct([*candidates, *agreed], HYPOTHESES), matching, EXAMINED)
         answers = least_turned(settle(candidates, matching, reaches(method)[0], method), guess)
         found = examine(answers, matching)
-        if confidence(found.evidence) < SURE and method == "symmetric":
+        sure = confidence(found.evidence)
+        if sure < SURE and method == "symmetric":
             near = partial(within, max_angle, guess)
             answers = told_apart(slid(answers, matching, near, method), matching, near)
             found = examine(answers, matching)
-        sure = confidence(found.evidence)
+            sure = confidence(found.evidence)
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
         )
