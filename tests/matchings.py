@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from scipy.spatial.distance import cdist
@@ -9,6 +11,7 @@ from torch import Tensor
 
 from idam.matching import FeatureMatches, Matching
 from idam.pyramid import Level
+from idam.ranking import Answer
 from motions import move
 
 TOLERANCE = 0.02
@@ -63,3 +66,8 @@ def vase(count: int, seed: int) -> np.ndarray:
     angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.8, 0.8, count)
     radius = 0.4 + 0.15 * np.cos(4 * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def anything(transformations: Iterable[np.ndarray]) -> list[Answer]:
+    """Transforms (4, 4) as answers, however far they turn."""
+    return [Answer(x) for x in transformations]

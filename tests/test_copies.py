@@ -13,7 +13,7 @@ from idam.copies import nearer, told_apart
 from idam.matching import Matching
 from idam.pyramid import Level, spacing_of
 from idam.ranking import Answer
-from matchings import matching_by, vase
+from matchings import anything, matching_by, vase
 from motions import move, rigid
 
 
@@ -24,10 +24,6 @@ def turned(degrees: float) -> np.ndarray:
 def degrees_off(answer: Answer) -> float:
     cosine = (np.trace(answer.transformation[:3, :3]) - 1) / 2
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def anything(transformations: Iterable[np.ndarray]) -> list[Answer]:
-    return [Answer(x) for x in transformations]
 
 
 def silent(source: np.ndarray, target: np.ndarray) -> Matching:

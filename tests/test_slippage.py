@@ -12,7 +12,7 @@ from idam.pyramid import Level
 from idam.ranking import Answer, scored
 from idam.refine import Refinable, Surfaces
 from idam.slippage import FARTHEST, slid, slips
-from matchings import matching_by, scores_for, vase
+from matchings import anything, matching_by, scores_for, vase
 from motions import rigid
 
 
@@ -31,10 +31,6 @@ def told_by_features(source: np.ndarray, target: np.ndarray) -> Matching:
     """Two clouds whose features say that they lie as they are."""
     clouds = Level(source, target, 0.05)
     return matching_by(clouds, scores_for(clouds, np.eye(4)))
-
-
-def anything(transformations: Iterable[np.ndarray]) -> list[Answer]:
-    return [Answer(x) for x in transformations]
 
 
 # --- slips ---------------------------------------------------------------------------------------------------------
