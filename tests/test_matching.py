@@ -12,6 +12,7 @@ from torch import Tensor
 
 from idam import matching as module
 from idam.consensus import agreeing_transforms
+from idam.errors import InputError
 from idam.matching import AGAINST, FEW, FOR, RANK, REACH, TOUCHING, FeatureMatches, Matching, mutual_matches
 from idam.network.config import Config
 from idam.network.features.invariant import Invariant, Surroundings, surroundings
@@ -171,6 +172,14 @@ def test_a_network_of_the_paper_s_kind_leaves_matching_to_the_default_one(
     network = IDAM()
     monkeypatch.setattr(network.features, "forward", lambda *_: pytest.fail("the network was asked"))
     np.testing.assert_array_equal(Matching.of(network, clouds).score, Matching.of(load_model(), clouds).score)
+
+
+def test_a_network_of_the_paper_s_kind_may_name_the_model_to_match_by(clouds: Level) -> None:
+    other = "practice-any-rotation"
+    matching = Matching.of(IDAM(Config(matched_by=other)), clouds)
+    np.testing.assert_array_equal(matching.score, Matching.of(load_model(other), clouds).score)
+    with pytest.raises(InputError, match=r"^matched_by=gnn-practice: its features turn with the cloud; name a model"):
+        Matching.of(IDAM(Config(matched_by="gnn-practice")), clouds)
 
 
 @pytest.mark.parametrize("name", MODELS)

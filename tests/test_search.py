@@ -26,14 +26,15 @@ from idam.search import (
     SEEDS,
     STARTS,
     SURE,
+    TAUGHT,
     Found,
+    ask_once,
     examine,
     inverse,
     least_turned,
     ranked,
     search,
     settle,
-    within,
 )
 from matchings import as_matches, matching_by, scores_for
 from motions import move, rigid
@@ -317,13 +318,6 @@ def test_nothing_is_looked_into_that_turns_too_far_from_the_guess(
     np.testing.assert_allclose(found.answers[0].transformation, TRUTH, atol=0.01)
 
 
-def test_within_counts_from_the_guess() -> None:
-    turns = [rigid([0.0, 0.0, np.radians(degrees)], [0.0, 0.0, 0.1]) for degrees in (0, 30, 60, 90, 180)]
-    kept = within(45.0, turns[2], turns)
-    assert [answer.transformation for answer in kept] == turns[1:4]
-    assert len(within(180.0, turns[2], turns)) == 5
-
-
 def test_a_guess_far_off_does_no_harm(easy: Pyramid, silent: IDAM, found: Found) -> None:
     other = search(easy, silent, FAR, 0, "gicp")
     np.testing.assert_allclose(other.answers[0].transformation, found.answers[0].transformation, atol=1e-3)
@@ -387,6 +381,62 @@ def test_a_symmetric_thing_is_turned_no_more_than_it_must_be(silent: IDAM) -> No
         found = search(clouds, network, half_turn, 0, "gicp")
         np.testing.assert_allclose(found.answers[0].transformation, turn @ half_turn, atol=0.05)
         assert found.evidence.margin < CLOSE
+
+
+@pytest.fixture(scope="module")
+def prism() -> Pyramid:
+    """A square prism, that four turns leave as it is: one by 40 degrees, another by -50."""
+    box = trimesh.creation.box((0.8, 0.8, 1.1))
+    source, target = (np.asarray(trimesh.sample.sample_surface(box, 900, seed=seed)[0]) for seed in (1, 2))
+    return build_pyramid(source, move(about_z(40), target), None)
+
+
+def about_z(degrees: float) -> np.ndarray:
+    return rigid([0.0, 0.0, np.radians(degrees)], [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_of_poses_alike_the_network_chooses_among_those_it_was_taught(
+    prism: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch, exchanged: bool
+) -> None:
+    def propose(_: IDAM, source: np.ndarray, *__: object) -> list[np.ndarray]:
+        assert source is prism.small.source  # the caller's
+        return [about_z(-44)]
+
+    def chosen() -> Found:
+        if exchanged:
+            return search(prism.swapped(), silent, np.eye(4), 0, "symmetric", max_angle=TAUGHT).inverted()
+        return search(prism, silent, np.eye(4), 0, "symmetric", max_angle=TAUGHT)
+
+    monkeypatch.setattr(searching, "propose", propose)
+    found = chosen()
+    np.testing.assert_allclose(found.answers[0].transformation, about_z(-50), atol=0.05)
+    # there is another, and the answer is no surer for being chosen
+    assert any(np.allclose(other.transformation, about_z(40), atol=0.05) for other in found.answers[1:])
+    assert found.evidence.margin < CLOSE
+    monkeypatch.setattr(searching, "TAUGHT", TAUGHT - 1)
+    monkeypatch.setattr(searching, "propose", lambda *_: [])
+    np.testing.assert_allclose(chosen().answers[0].transformation, about_z(40), atol=0.05)
+
+
+def test_the_network_turns_on_from_the_guess_whichever_cloud_is_matched_to_which(easy: Pyramid, asked: Asked) -> None:
+    guess = rigid([0.5, -0.2, 0.1], [0.0, 0.0, 0.0])
+    (there,) = ask_once(asked, easy, guess)
+    (back,) = ask_once(asked, easy.swapped(), inverse(guess))
+    np.testing.assert_allclose(inverse(back), there, atol=1e-6)
+    source = torch.as_tensor(easy.small.source @ guess[:3, :3].T).float()
+    assert (
+        sum(cloud.shape[1:] == source.shape and torch.allclose(cloud[0], source, atol=1e-6) for cloud in asked.clouds)
+        == 2
+    )
+
+
+def test_a_network_that_is_far_off_chooses_nothing(
+    prism: Pyramid, silent: IDAM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searching, "propose", lambda *_: [rigid([0.9, 0.0, 0.0], [0.0, 0.3, 0.0])])
+    found = search(prism, silent, np.eye(4), 0, "symmetric", max_angle=TAUGHT)
+    np.testing.assert_allclose(found.answers[0].transformation, about_z(40), atol=0.05)
 
 
 def test_settle_refines_and_scores(steps: Pyramid) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from idam.errors import InputError
 from idam.network.ablation import inner_products
 from idam.network.features.invariant import Invariant, Surroundings, surroundings
 from idam.network.model import IDAM
@@ -83,8 +83,9 @@ class Matching:
     @classmethod
     @torch.inference_mode()
     def of(cls, network: IDAM, clouds: Level) -> Matching:
-        """By a network's features, or by the default model's where it is of the paper's kind."""
-        features = network.features if isinstance(network.features, Invariant) else default_features()
+        """By a network's features, or by those of the model that it names where its own turn with the cloud."""
+        own = network.features
+        features = own if isinstance(own, Invariant) else features_of(network.config.matched_by)
         points = [torch.as_tensor(cloud, dtype=torch.float32) for cloud in (clouds.source, clouds.target)]
         score = inner_products(*(described(features, surroundings(cloud, clouds.spacing)) for cloud in points))
         row, column = score.logsumexp(1), score.logsumexp(0)
@@ -107,10 +108,13 @@ class Matching:
         return float(torch.minimum(by_row, by_column).clamp(AGAINST, FOR).sum() / min(self.score.shape))
 
 
-@lru_cache(1)
-def default_features() -> Invariant:
-    """Those of the default model, on the CPU."""
-    return cast(Invariant, load_model().features)
+@lru_cache(2)
+def features_of(model: str) -> Invariant:
+    """Those of a model, on the CPU; raise InputError where they turn with the cloud."""
+    features = load_model(model).features
+    if not isinstance(features, Invariant):
+        raise InputError(f"matched_by={model}: its features turn with the cloud; name a model such as general")
+    return features
 
 
 def described(features: Invariant, around: Surroundings) -> Tensor:

@@ -63,11 +63,13 @@ class Pyramid:
         fine: for the last refinement.
         all_small: whether there are no larger clouds to match: the small ones hold all points, or the caller chose
             them.
+        exchanged: whether what is called the source here is the caller's target.
     """
 
     small: Level
     fine: Level
     all_small: bool = False
+    exchanged: bool = False
 
     @cached_property
     def larger(self) -> Level:
@@ -76,7 +78,7 @@ class Pyramid:
 
     def swapped(self) -> Pyramid:
         """With source and target exchanged."""
-        return Pyramid(self.small.swapped(), self.fine.swapped(), self.all_small)
+        return Pyramid(self.small.swapped(), self.fine.swapped(), self.all_small, not self.exchanged)
 
 
 def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> Pyramid:

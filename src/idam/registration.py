@@ -57,7 +57,8 @@ def register(
         model: name of the network's weights (:func:`idam.list_models`), or the path of a file of them.
         init: (4, 4), a guess of the transform: an answer to consider, and where the network's starts turn around.
         max_angle: degrees by which the answer turns at most, from the guess where there is one: of a symmetric thing's
-            poses it can rule out all but one. The last refinement may go a little past it.
+            poses it can rule out all but one. The last refinement may go a little past it. At 90 and less, a model of
+            the paper's kind, whose name begins with ``gnn`` or ``fpfh``, has the choice among poses alike.
         voxel_size: of the clouds that matches are sought in, in the input's units; None takes it from the data.
         max_correspondence_distance: for fitness, RMSE and correspondences, in the input's units; None for one and a
             half spacings of the points of the last refinement.

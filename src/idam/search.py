@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from idam.pyramid import Level, Pyramid
 from idam.ranking import Answer, distinct, improve, likeliest
 from idam.refine import reaches
 from idam.result import Matches
+from idam.scope import Scope
 from idam.slippage import slid
 
 __all__ = ["Found", "inverse", "search"]
@@ -42,6 +42,10 @@ CONTENDERS = 6
 """Answers that are kept, and that stay in the race against what larger clouds say."""
 STARTED = 4.0
 """Spacings within which points pull on each other after the network."""
+TAUGHT = 90.0
+"""Degrees that the pairs which a network of the paper's kind is taught are turned at most."""
+NEAR = 20.0
+"""Degrees from such a network's answer within which transforms are looked into."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -78,7 +82,9 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
     larger ones are; the best answers so far have to stand against what they say. At last a network of the paper's kind,
-    whose matches depend on the pose, is asked from many rotations.
+    whose matches depend on the pose, is asked from many rotations. But where nothing is turned by more than it was
+    taught, it is asked from the guess alone: of poses that look alike it may have learnt which is meant. What is found
+    near its answer comes first where it would be surer with all else ruled out; all else has its say in how sure it is.
 
     Args:
         clouds: in working coordinates.
@@ -88,32 +94,54 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         method: of refinement, or ``none``.
         max_angle: degrees from the guess past which no transform is looked into.
     """
-    candidates = [Answer(guess)]
+    scope, candidates = Scope(guess, max_angle), [Answer(guess)]
     for level, seeds in to_match(clouds):
         matching = Matching.of(network, level)
-        agreed = within(max_angle, guess, agreeing_transforms(matching.matches, seeds))
-        candidates = likeliest(distinct([*candidates, *agreed], HYPOTHESES), matching, EXAMINED)
-        answers = least_turned(settle(candidates, matching, reaches(method)[0], method), guess)
-        found = examine(answers, matching)
+        agreed = agreeing_transforms(matching.matches, seeds)
+        found = explain([*candidates, *scope.within(agreed)], matching, scope, method)
         sure = confidence(found.evidence)
-        if sure < SURE and method == "symmetric":
-            near = partial(within, max_angle, guess)
-            answers = told_apart(slid(answers, matching, near, method), matching, near)
-            found = examine(answers, matching)
-            sure = confidence(found.evidence)
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
         )
         if sure >= SURE:
             return found
-        candidates = answers
+        candidates = found.answers
     if isinstance(network.features, Invariant):
         return found
-    starts = starting_rotations(STARTS, seed) @ torch.as_tensor(guess[:3, :3], dtype=torch.float32)
-    learned = distinct(within(max_angle, guess, propose(network, clouds.small.source, clouds.small.target, starts)))
+    for answer in scope.within(ask_once(network, clouds, guess)) if max_angle <= TAUGHT else []:
+        nearby = scope.around(answer.transformation, NEAR)
+        near = explain([answer, *nearby.within(agreed)], matching, nearby, method)
+        log.info("near the network's answer, all else ruled out: confidence %.2f", confidence(near.evidence))
+        if confidence(near.evidence) >= sure:
+            return examine(distinct([*near.answers, *found.answers]), matching)
+    starts = scope.turns(starting_rotations(STARTS, seed))
+    learned = distinct(scope.within(propose(network, clouds.small.source, clouds.small.target, starts)))
     log.info("the network, started from %d rotations, found %d transforms", len(starts), len(learned))
-    answers = ranked([*answers, *settle(learned, matching, STARTED, method)])
+    answers = ranked([*found.answers, *settle(learned, matching, STARTED, method)])
     return examine(least_turned(answers, guess), matching)
+
+
+def ask_once(network: IDAM, clouds: Pyramid, guess: Points) -> list[Points]:
+    """What the network makes of the caller's source and target, starting from the guess.
+
+    Not of the two exchanged: of the pairs that it was taught, the source stands as the data's shapes do. It has come to
+    count on that, and errs far more often the other way round.
+    """
+    turn = torch.as_tensor(guess[None, :3, :3], dtype=torch.float32)
+    if clouds.exchanged:
+        return [inverse(x) for x in propose(network, clouds.small.target, clouds.small.source, turn.mT)]
+    return propose(network, clouds.small.source, clouds.small.target, turn)
+
+
+def explain(candidates: Iterable[Answer], matching: Matching, scope: Scope, method: str) -> Found:
+    """What the likeliest of the candidates come to: refined, scored and looked at closely."""
+    tried = likeliest(distinct(candidates, HYPOTHESES), matching, EXAMINED)
+    answers = least_turned(settle(tried, matching, reaches(method)[0], method), scope.guess)
+    found = examine(answers, matching)
+    if method == "symmetric" and confidence(found.evidence) < SURE:
+        answers = told_apart(slid(answers, matching, scope.within, method), matching, scope.within)
+        found = examine(answers, matching)
+    return found
 
 
 def to_match(clouds: Pyramid) -> Iterator[tuple[Level, int]]:
@@ -121,12 +149,6 @@ def to_match(clouds: Pyramid) -> Iterator[tuple[Level, int]]:
     if not clouds.all_small:
         yield clouds.small, SEEDS[0]
     yield clouds.larger, SEEDS[1]
-
-
-def within(max_angle: float, guess: Points, transformations: Iterable[Points]) -> list[Answer]:
-    """The transforms (4, 4) that turn no further from the guess, in degrees, as answers."""
-    least = 1 + 2 * np.cos(np.radians(max_angle)) - 1e-9  # of the trace, which falls with the angle
-    return [Answer(x) for x in transformations if np.trace(guess[:3, :3].T @ x[:3, :3]) >= least]
 
 
 def settle(answers: list[Answer], matching: Matching, reach: float, method: str) -> list[Answer]:
