@@ -124,8 +124,8 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
 def ask_once(network: IDAM, clouds: Pyramid, guess: Points) -> list[Points]:
     """What the network makes of the caller's source and target, starting from the guess.
 
-    Not of the two exchanged: of the pairs that it was taught, the source stands as the data's shapes do, and it may have
-    come to count on that (``gnn-practice`` has: see docs/architecture.md).
+    Not of the two exchanged: of the pairs that it was taught, the source stands as the data's shapes do, and it may
+    have come to count on that (``gnn-practice`` has: see docs/architecture.md).
     """
     turn = torch.as_tensor(guess[None, :3, :3], dtype=torch.float32)
     if clouds.exchanged:
