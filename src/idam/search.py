@@ -83,8 +83,8 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
     larger ones are; the best answers so far have to stand against what they say. At last a network of the paper's kind,
     whose matches depend on the pose, is asked from many rotations. But where nothing is turned by more than it was
-    taught, it is asked from the guess alone: of poses that look alike it may have learnt which is meant. What is found
-    near its answer comes first where it would be surer with all else ruled out; all else has its say in how sure it is.
+    taught, it is first asked from the guess alone: of poses that look alike it may have learnt which is meant. What is
+    found near its answer is taken where it would be surer with all else ruled out; yet how sure it is, all else counts.
 
     Args:
         clouds: in working coordinates.
@@ -113,7 +113,8 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
         near = explain([answer, *nearby.within(agreed)], matching, nearby, method)
         log.info("near the network's answer, all else ruled out: confidence %.2f", confidence(near.evidence))
         if confidence(near.evidence) >= sure:
-            return examine(distinct([*near.answers, *found.answers]), matching)
+            best, *others = near.answers
+            return examine(distinct([best, *ranked([*others, *found.answers])]), matching)
     starts = scope.turns(starting_rotations(STARTS, seed))
     learned = distinct(scope.within(propose(network, clouds.small.source, clouds.small.target, starts)))
     log.info("the network, started from %d rotations, found %d transforms", len(starts), len(learned))
