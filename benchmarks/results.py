@@ -41,8 +41,8 @@ medians of one pair at a time on a busy machine: compare those under Efficiency,
   learnt from are halves of ModelNet40's training shapes, of all categories: to it, the unseen categories are not new.
   It knows of no limit to the rotation, and may find a symmetric shape's other pose; `register-90` is told that nothing
   turns by more than 90 degrees (`max_angle=90`): the paper's three angles of up to 45 make no more than 86. Of poses
-  that look alike, a `gnn` model named beside it chooses, which it can have learnt: every source stands as ModelNet's
-  shapes do.
+  that look alike, a `gnn` model named beside it chooses: it learnt how pairs are turned, and may have learnt how shapes
+  stand, since every source stands as ModelNet's shapes do.
 - `gnn-idam-icp` is the network, and the symmetric ICP that `register` ends sparse clouds with.
 - Go-ICP is in neither table closer to practice: with no point in common, its search had not ended on the first pair
   after 17 minutes.
