@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from idam.geometry import rotation_angle
 from idam.ranking import Answer
 
 __all__ = ["Scope"]
@@ -35,19 +35,26 @@ class Scope:
 
     def within(self, transformations: Iterable[Points]) -> list[Answer]:
         """The transforms (4, 4) that are in the scope, as answers."""
-        return [Answer(x) for x in transformations if self._angle(x[:3, :3]) <= self.max_angle + ROUNDING]
+        given = list(transformations)
+        if not given:
+            return []
+        held = self._holds(torch.as_tensor(np.stack(given)[:, :3, :3]))
+        return [Answer(given[n]) for n in held.nonzero().flatten().tolist()]
 
     def turns(self, rotations: Tensor) -> Tensor:
         """Those of the rotations (n, 3, 3), each after the guess's, that are in the scope."""
         turned = rotations @ torch.as_tensor(self.guess[:3, :3], dtype=rotations.dtype)
-        within = [self._angle(rotation) <= self.max_angle + ROUNDING for rotation in turned.double().numpy()]
-        return turned[torch.tensor(within)]
+        return turned[self._holds(turned)]
 
     def around(self, transformation: Points, max_angle: float) -> Scope:
         """A scope of ``max_angle`` about one of this scope's transforms, or of less, so that it lies in this one."""
-        return Scope(transformation, min(max_angle, self.max_angle - self._angle(transformation[:3, :3])))
+        turned = float(self._degrees(torch.as_tensor(transformation[:3, :3])))
+        return Scope(transformation, min(max_angle, self.max_angle - turned))
 
-    def _angle(self, rotation: Points) -> float:
-        """Degrees from the guess to a rotation (3, 3); unlike the arc cosine of a trace, exact for small ones."""
-        apart = np.linalg.norm(self.guess[:3, :3] - rotation) / math.sqrt(8)
-        return math.degrees(2 * math.asin(min(apart, 1.0)))
+    def _holds(self, rotations: Tensor) -> Tensor:
+        """Whether each rotation (n, 3, 3) is in the scope, (n,)."""
+        return self._degrees(rotations) <= self.max_angle + ROUNDING
+
+    def _degrees(self, rotations: Tensor) -> Tensor:
+        """Degrees from the guess to each rotation (..., 3, 3)."""
+        return rotation_angle(torch.as_tensor(self.guess[:3, :3]).T @ rotations.double())

@@ -111,8 +111,9 @@ def search(clouds: Pyramid, network: IDAM, guess: Points, seed: int, method: str
     for answer in scope.within(ask_once(network, clouds, guess)) if max_angle <= TAUGHT else []:
         nearby = scope.around(answer.transformation, NEAR)
         near = explain([answer, *nearby.within(agreed)], matching, nearby, method)
-        log.info("near the network's answer, all else ruled out: confidence %.2f", confidence(near.evidence))
-        if confidence(near.evidence) >= sure:
+        surer = confidence(near.evidence)
+        log.info("near the network's answer, all else ruled out: confidence %.2f", surer)
+        if surer >= sure:
             best, *others = near.answers
             return examine(distinct([best, *ranked([*others, *found.answers])]), matching)
     starts = scope.turns(starting_rotations(STARTS, seed))
