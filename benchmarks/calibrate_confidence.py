@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import idam
-from idam.confidence import features
-from idam.data.general import Material, draw_scans
-from idam.data.parts import View, partial_views, random_part
-from idam.evaluation.metrics import motion_error
-from idam.figures.curves import calibrate
+from idam.lab.data.general import Material, draw_scans
+from idam.lab.data.parts import View, partial_views, random_part
+from idam.lab.evaluation.metrics import motion_error
+from idam.lab.figures.curves import calibrate
+from idam.search.confidence import features
 
 FILE = Path(idam.__file__).parent / "confidence.json"
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def draw(path: Path, said: Array, right: Array) -> None:
     """The reliability diagram, and the share of wrong answers among the surest: the risk at each coverage."""
     from matplotlib.figure import Figure
 
-    from idam.figures.style import BLUE, ORANGE
+    from idam.report.style import BLUE, ORANGE
 
     curve = calibrate(torch.from_numpy(said), torch.from_numpy(right))
     figure = Figure((9, 4), dpi=120, layout="constrained")

@@ -12,9 +12,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from idam.evaluation.methods import METHODS
-from idam.evaluation.paper import PAPER
-from idam.figures.style import BLUE, ORANGE, VERMILLION, look, save
+from idam.lab.evaluation.methods import METHODS
+from idam.lab.evaluation.paper import PAPER
+from idam.report.style import BLUE, ORANGE, VERMILLION, look, save
 
 ERRORS = {
     "unseen-shapes": "unseen shapes",

@@ -12,9 +12,9 @@ from typing import Any
 
 import scans
 
-from idam.evaluation.methods import METHODS
-from idam.evaluation.runner import Row
-from idam.evaluation.table import columns
+from idam.lab.evaluation.methods import METHODS
+from idam.lab.evaluation.runner import Row
+from idam.lab.evaluation.table import columns
 
 TITLES = {
     "unseen-shapes": "Unseen shapes (section 4.1)",

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 import idam
-from idam.data.parts import View, partial_views, random_part
-from idam.evaluation.metrics import motion_error
+from idam.lab.data.parts import View, partial_views, random_part
+from idam.lab.evaluation.metrics import motion_error
 
 KEEP = 0.75
 """Share of the surface in each view."""

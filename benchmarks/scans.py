@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import idam
-from idam.evaluation.methods import build_method
-from idam.evaluation.metrics import motion_error
-from idam.evaluation.record import processor
 from idam.io import read_point_cloud
+from idam.lab.evaluation.methods import build_method
+from idam.lab.evaluation.metrics import motion_error
+from idam.lab.evaluation.record import processor
 
 Points = NDArray[np.float64]
 Register = Callable[[Points, Points], tuple[Points, float | None]]

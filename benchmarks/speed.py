@@ -22,11 +22,11 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from idam.data.pairs import MAX_ANGLE
 from idam.errors import MissingDependencyError
-from idam.evaluation.methods import Method, build_method, rows_of
-from idam.evaluation.record import processor
-from idam.geometry import euler_xyz_to_rotation
+from idam.lab.data.pairs import MAX_ANGLE
+from idam.lab.evaluation.methods import Method, build_method, rows_of
+from idam.lab.evaluation.record import processor
+from idam.network.geometry import euler_xyz_to_rotation
 
 Points = NDArray[np.float32]
 ENDLESS = ("go-icp",)

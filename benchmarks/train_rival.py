@@ -21,23 +21,23 @@ from pathlib import Path
 import torch
 from torch.nn.utils import clip_grad_norm_
 
-from idam.data.modelnet40 import experiment_shapes
-from idam.data.pairs import Pairs
 from idam.errors import InputError, MissingDependencyError
-from idam.evaluation.methods.dcp import DCP
-from idam.evaluation.methods.learned.features import Features
-from idam.evaluation.methods.learned.rival import Rival
-from idam.evaluation.methods.pointnetlk import PointNetLK
-from idam.evaluation.methods.prnet import PRNet
 from idam.io import make_folder
-from idam.memory import keep_freed_memory
+from idam.lab.data.modelnet40 import experiment_shapes
+from idam.lab.data.pairs import Pairs
+from idam.lab.evaluation.methods.dcp import DCP
+from idam.lab.evaluation.methods.learned.features import Features
+from idam.lab.evaluation.methods.learned.rival import Rival
+from idam.lab.evaluation.methods.pointnetlk import PointNetLK
+from idam.lab.evaluation.methods.prnet import PRNet
+from idam.lab.training.batches import generator_at, pairs_at, split_validation
+from idam.lab.training.checkpoint import Progress, history, restore, save_checkpoint
+from idam.lab.training.log import Log
+from idam.lab.training.loop import check_batch, check_finite, check_installed, check_run
+from idam.lab.training.memory import keep_freed_memory
+from idam.lab.training.recipe import TRAININGS, Recipe, check
+from idam.lab.training.task import PairTask, validate
 from idam.network.pretrained import save_weights
-from idam.training.batches import generator_at, pairs_at, split_validation
-from idam.training.checkpoint import Progress, history, restore, save_checkpoint
-from idam.training.log import Log
-from idam.training.loop import check_batch, check_finite, check_installed, check_run
-from idam.training.recipe import TRAININGS, Recipe, check
-from idam.training.task import PairTask, validate
 
 RIVALS: dict[str, type[Rival]] = {rival.name: rival for rival in (PointNetLK, DCP, PRNet)}
 DROPS = (0.3, 0.6, 0.8)

@@ -9,9 +9,9 @@ import torch
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from idam.matching import FeatureMatches, Matching
-from idam.pyramid import Level
-from idam.ranking import Answer
+from idam.clouds.pyramid import Level
+from idam.search.matching import FeatureMatches, Matching
+from idam.search.ranking import Answer
 from motions import move
 
 TOLERANCE = 0.02

@@ -19,9 +19,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from idam.clouds.frame import check_points
 from idam.errors import InputError
 from idam.io import PointCloud, read_point_cloud, read_transform, write_point_cloud
-from idam.preprocess import check_points
 
 resource = pytest.importorskip("resource", reason="memory is limited by setrlimit, which this system lacks")
 

@@ -19,16 +19,16 @@ from scipy.spatial.transform import Rotation
 import idam
 from idam import RegistrationResult, registration
 from idam import search as searching
-from idam.confidence import CLOSE, CONVERGED, Evidence, confidence, doubt
+from idam.align import METHODS, Surfaces
+from idam.clouds.frame import common_frame
 from idam.errors import InputError
 from idam.io import PointCloud, write_point_cloud
-from idam.matching import FOR
 from idam.network.pretrained import find
-from idam.preprocess import common_frame
-from idam.ranking import alike
-from idam.refine import METHODS, Surfaces
 from idam.registration import as_rigid, in_input_units, smaller_first
 from idam.result import Matches
+from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence, doubt
+from idam.search.matching import FOR
+from idam.search.ranking import alike
 from motions import move
 
 UTM = np.array([5e5, 5.6e6, 100.0])

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 import idam
 from idam import RegistrationResult
-from idam.confidence import Evidence
 from idam.errors import InputError
 from idam.io import read_transform
 from idam.result import Hypothesis, Matches
+from idam.search.confidence import Evidence
 
 SLOW = {"torch", "scipy", "small_gicp", "trimesh"}
 

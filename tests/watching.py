@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from idam.training.log import Log
+from idam.lab.training.log import Log
 
 __all__ = ["watched_log"]
 

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from idam.confidence import CONVERGED, confidence, doubt
+from idam.align import METHODS, TOUCHING, align, reaches
+from idam.clouds.frame import Frame, check_points, common_frame, without_strays
+from idam.clouds.pyramid import build_pyramid
 from idam.errors import InputError
-from idam.hypotheses import nearest_rotation
 from idam.io import as_point_cloud, rigid_fault
 from idam.network.model import IDAM
 from idam.network.pretrained import find, load_model
-from idam.preprocess import Frame, check_points, common_frame, without_strays
-from idam.pyramid import build_pyramid
-from idam.refine import METHODS, TOUCHING, align, reaches
+from idam.network.propose import nearest_rotation
 from idam.result import Hypothesis, Matches, RegistrationResult
-from idam.scoring import inliers
-from idam.search import inverse, search
+from idam.search.confidence import CONVERGED, confidence, doubt
+from idam.search.overlap import inliers
+from idam.search.stages import inverse, search
 
 __all__ = ["register"]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from idam.confidence import Evidence
+from idam.search.confidence import Evidence
 
 __all__ = ["Hypothesis", "Matches", "RegistrationResult"]
 
@@ -35,7 +35,7 @@ class Hypothesis:
 
     Attributes:
         transformation: (4, 4), source to target coordinates, not refined on all points.
-        score: what it was ranked by (:attr:`idam.ranking.Answer.score`); the answer's is higher, or nearly as high and
+        score: what it was ranked by (:attr:`idam.search.ranking.Answer.score`); the answer's is higher, or nearly as high and
             the answer is turned less.
     """
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from idam.data.pairs import make_pairs
-from idam.geometry import weighted_procrustes
+from idam.lab.data.pairs import make_pairs
 from idam.network.ablation import EqualValidity, InnerProduct, RandomSignificance
 from idam.network.config import Config
+from idam.network.geometry import weighted_procrustes
 from idam.network.model import IDAM
 
 WITHOUT = ("convolution", "hard_elimination", "hybrid_elimination")

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from idam.geometry import nearest_neighbours
 from idam.network.features.gnn import GNN, EdgeLayer, neighbour_difference, neighbour_graph, neighbour_maximum
+from idam.network.geometry import nearest_neighbours
 
 MODES = pytest.mark.parametrize("train", [False, True], ids=["eval", "train"])
 

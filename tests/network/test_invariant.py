@@ -6,8 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from idam.data.surfaces import random_blob
-from idam.geometry import apply_transform, random_rotation
+from idam.lab.data.surfaces import random_blob
 from idam.network.config import Config
 from idam.network.features import build_features
 from idam.network.features.fpfh import FPFH
@@ -22,6 +21,7 @@ from idam.network.features.invariant import (
     surroundings,
 )
 from idam.network.features.normals import nearest_neighbours_of
+from idam.network.geometry import apply_transform, random_rotation
 from idam.network.model import IDAM
 
 

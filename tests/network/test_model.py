@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from idam.geometry import apply_transform, gather_points, weighted_procrustes
 from idam.network.config import Config
 from idam.network.elimination import hybrid_weights
 from idam.network.features import GNN, build_features
+from idam.network.geometry import apply_transform, gather_points, weighted_procrustes
 from idam.network.model import IDAM
 from idam.network.similarity import SimilarityConvolution
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idam.geometry import apply_transform, gather_points, random_rotation
+from idam.network.geometry import apply_transform, gather_points, random_rotation
 from idam.network.model import Iteration
 from idam.network.supervision import Loss, mutual_supervision
 

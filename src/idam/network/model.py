@@ -8,11 +8,11 @@ from itertools import product
 import torch
 from torch import Tensor, nn
 
-from idam.geometry import apply_transform, compose, gather_points, weighted_procrustes
 from idam.network.ablation import EqualValidity, InnerProduct, RandomSignificance
 from idam.network.config import Config
 from idam.network.elimination import Significance, Validity, hybrid_weights, keep_most_significant
 from idam.network.features import build_features
+from idam.network.geometry import apply_transform, compose, gather_points, weighted_procrustes
 from idam.network.similarity import SimilarityConvolution
 
 __all__ = ["IDAM", "Iteration", "KeyPoints", "Output"]

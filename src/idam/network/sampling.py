@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from idam.geometry import nearest
+from idam.network.geometry import nearest
 
 __all__ = ["balanced_sample"]
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from idam.geometry import apply_transform, nearest
+from idam.network.geometry import apply_transform, nearest
 from idam.network.model import Iteration
 
 __all__ = ["Loss", "mutual_supervision"]

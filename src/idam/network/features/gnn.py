@@ -19,8 +19,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from idam.geometry import nearest_neighbours
 from idam.network.features.normals import nearest_neighbours_of
+from idam.network.geometry import nearest_neighbours
 from idam.network.layers import NormalisedLinear
 
 __all__ = ["GNN", "EdgeLayer", "neighbour_graph"]

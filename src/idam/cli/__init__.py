@@ -1,0 +1,67 @@
+"""The command line: parse, call, print. Everything heavy is imported by the command that needs it."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from idam import __version__
+from idam.cli.data import data
+from idam.cli.demo import demo
+from idam.cli.evaluate import evaluate
+from idam.cli.figures import figures
+from idam.cli.models import models
+from idam.cli.register import register
+from idam.cli.shared import BAD_INPUT
+from idam.cli.train import train
+from idam.errors import InputError, MissingDependencyError
+
+__all__ = ["main"]
+
+app = typer.Typer(
+    name="idam",
+    help="Learned global registration of partially overlapping 3D point clouds.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+
+def main() -> NoReturn:
+    """Run the command line; bad input ends in one line on stderr and exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except (InputError, MissingDependencyError) as error:
+        stop(str(error), BAD_INPUT)
+    except (KeyboardInterrupt, typer.Abort):
+        stop("interrupted", 130)
+    except Exception as error:
+        usage = getattr(error, "format_message", None)  # what the parser raises for a wrong call
+        if usage is None:
+            raise
+        if not usage():  # no command: the help has been printed
+            sys.exit(BAD_INPUT)
+        stop(f"{usage()} See 'idam --help'.", BAD_INPUT)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def stop(message: str, code: int) -> NoReturn:
+    """Print one line on stderr and exit."""
+    print("idam: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(code)
+
+
+@app.callback(invoke_without_command=True)
+def about(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    """Learned global registration of partially overlapping 3D point clouds."""
+    if version:
+        print(f"idam {__version__}")
+        raise typer.Exit
+
+
+for command in (register, demo, models, train, evaluate, figures):
+    app.command()(command)
+app.add_typer(data, name="data")

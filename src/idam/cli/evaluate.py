@@ -1,0 +1,70 @@
+"""``idam evaluate``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from idam.errors import InputError
+
+__all__ = ["evaluate"]
+
+
+def evaluate(
+    experiment: Annotated[
+        str | None,
+        typer.Argument(
+            help="unseen-shapes, unseen-categories, gaussian-noise, ablation, practice or practice-any-rotation; "
+            "or give --pairs."
+        ),
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")] = None,
+    pairs: Annotated[Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t.")] = None,
+    method: Annotated[list[str] | None, typer.Option(help="Rows to compute; all if left out.")] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Weights for the learned rows; those trained for the experiment if left out.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the one method asked for."),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only so many pairs, for a quick look.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the pairs.")] = 1,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the rows here, after each of them.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the rows that the JSON file has already.")] = False,
+) -> None:
+    """Measure methods on the pairs of an experiment, or on your own; the paper's figures stand in brackets.
+
+    [bold]Examples[/bold]
+
+      idam evaluate unseen-shapes --data modelnet40 --limit 100
+
+      idam evaluate gaussian-noise --data modelnet40 --method fgr --set fgr_distance=0.05
+
+      idam evaluate --pairs pairs.npz --method gnn-idam --model gnn-unseen-shapes --json out.json
+    """
+    from idam.lab.evaluation.evaluate import evaluate as run
+    from idam.lab.evaluation.experiments import read_pairs, test_set
+
+    if (experiment is None) == (pairs is None):
+        raise InputError("give either an experiment with --data or your own --pairs")
+    if pairs is not None:
+        test = read_pairs(pairs)
+    elif data is None:
+        raise InputError("an experiment needs --data, the folder of ModelNet40")
+    else:
+        test = test_set(str(experiment), data)
+    run(
+        test if limit is None else test.first(limit),
+        method,
+        model=model,
+        settings=settings or (),
+        jobs=jobs,
+        output=json,
+        resume=resume,
+        command=shlex.join(["idam", *sys.argv[1:]]),
+    )

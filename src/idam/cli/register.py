@@ -1,0 +1,134 @@
+"""``idam register``."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from idam.cli.shared import UNSURE, show
+from idam.errors import InputError
+
+__all__ = ["register"]
+
+
+def register(
+    source: Annotated[Path, typer.Argument(help="The cloud to move.")],
+    target: Annotated[Path, typer.Argument(help="The cloud to lay it on.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the moved source here, colours and normals kept.")
+    ] = None,
+    transform: Annotated[Path | None, typer.Option(help="Write the 4x4 here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the whole result here.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write a page to look at the result, opens offline.")] = None,
+    save_plot: Annotated[
+        Path | None, typer.Option(help="Draw the result as .png or .svg; needs idam[figures].")
+    ] = None,
+    model: Annotated[str, typer.Option(help="Name or file of the weights; see 'idam models'.")] = "default",
+    init: Annotated[Path | None, typer.Option(help="File of a 4x4 to start from.")] = None,
+    max_angle: Annotated[float, typer.Option(help="Degrees that it turns at most.")] = 180.0,
+    voxel_size: Annotated[
+        float | None, typer.Option(help="Resolution for the network; from the data if left out.")
+    ] = None,
+    max_correspondence_distance: Annotated[
+        float | None, typer.Option(help="Distance for fitness and RMSE; from the data if left out.")
+    ] = None,
+    refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point, symmetric or none.")] = "gicp",
+    seed: Annotated[int, typer.Option(help="Of the starting rotations.")] = 0,
+    device: Annotated[str, typer.Option(help="Where the network runs.")] = "cpu",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the 4x4 alone, for scripts.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on stderr what each step did and took.")
+    ] = False,
+) -> None:
+    """Lay SOURCE on TARGET: print the transform and how sure it is.
+
+    The files may be PLY, PCD, XYZ, TXT, CSV, PTS, NPY, NPZ, OBJ, STL, OFF, LAS or LAZ. The exit code is 0 for a
+    confident answer, 1 for one that is likely wrong and 2 for bad input.
+
+    [bold]Examples[/bold]
+
+      idam register scan1.ply scan2.ply
+
+      idam register scan1.ply scan2.ply -o aligned.ply --transform T.txt --html look.html
+
+      idam register scan1.ply scan2.ply -q > T.txt && echo "sure enough"
+    """
+    from idam import registration
+    from idam.io import (
+        check_destination,
+        check_writable,
+        read_point_cloud,
+        read_transform,
+        write_point_cloud,
+        write_transform,
+    )
+
+    # before the work, and before the first of them is written
+    if output is not None:
+        check_writable(output)
+    for path in (transform, json, html, save_plot):
+        if path is not None:
+            check_destination(path)
+    if save_plot is not None:
+        check_drawable(save_plot)
+    source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
+    with steps_told(verbose):
+        result = registration.register(
+            source_cloud,
+            target_cloud,
+            model=model,
+            init=None if init is None else read_transform(init),
+            max_angle=max_angle,
+            voxel_size=voxel_size,
+            max_correspondence_distance=max_correspondence_distance,
+            refine=refine,
+            seed=seed,
+            device=device,
+        )
+    if output is not None:
+        write_point_cloud(output, source_cloud.transformed(result.transformation))
+    if transform is not None:
+        write_transform(transform, result.transformation)
+    if json is not None:
+        result.save(json)
+    if html is not None:
+        from idam.report.page import write_report
+
+        write_report(html, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
+    if save_plot is not None:
+        from idam.report.plot import write_plot
+
+        write_plot(save_plot, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
+    show(result, quiet)
+    if not result.converged:
+        raise typer.Exit(UNSURE)
+
+
+def check_drawable(path: Path) -> None:
+    """Find out before the work whether a picture can be drawn there."""
+    from idam.report.view import check_matplotlib
+
+    if path.suffix.lower() not in (".png", ".svg"):
+        raise InputError(f"{path}: unknown picture format '{path.suffix}': the ones to draw are .png, .svg")
+    check_matplotlib("a result")
+
+
+@contextmanager
+def steps_told(verbose: bool) -> Iterator[None]:
+    """Write what the steps log to stderr, if that is asked for."""
+    log, handler = logging.getLogger("idam"), logging.StreamHandler()
+    level = log.level
+    if verbose:
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)

@@ -1,0 +1,40 @@
+"""What the commands share: exit codes, options, how a result is shown."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from idam.result import RegistrationResult
+
+__all__ = ["BAD_INPUT", "UNSURE", "Data", "show", "tell"]
+
+UNSURE = 1
+BAD_INPUT = 2
+
+Data = Annotated[Path, typer.Option("--data", help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")]
+
+
+def show(result: RegistrationResult, quiet: bool = False) -> None:
+    """Print a result: the 4x4 as CloudCompare takes it, then, unless quiet, the figures and why."""
+    from idam.io import format_transform
+
+    print(format_transform(result.transformation))
+    if quiet:
+        return
+    print(f"fitness     {result.fitness:.3f}  (within {result.max_correspondence_distance:.4g})")
+    print(f"inlier RMSE {result.inlier_rmse:.4g}")
+    print(f"confidence  {result.confidence:.2f}")
+    if result.reason:
+        print(f"reason      {result.reason}")
+    print(f"time        {result.seconds:.2f} s")
+
+
+def tell(what: str) -> None:
+    """Say on a terminal's stderr what is being done."""
+    if sys.stderr.isatty():
+        print(what, file=sys.stderr)

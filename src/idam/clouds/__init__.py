@@ -1,0 +1,1 @@
+"""What depends on a cloud's points alone: frame, voxel grid, levels of resolution, surfaces."""

@@ -1,0 +1,31 @@
+"""The shipped example: two views of a CAD part, registered and written out to look at."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from idam.io import make_folder, read_point_cloud, write_point_cloud, write_transform
+from idam.registration import register
+from idam.report.page import write_report
+from idam.result import RegistrationResult
+
+__all__ = ["run"]
+
+
+def run(output: Path) -> tuple[RegistrationResult, dict[str, Path]]:
+    """Register the shipped scans, and write the page, the aligned cloud and the transform to a folder.
+
+    Raises:
+        InputError: the folder cannot be made or written.
+    """
+    make_folder(output)
+    folder = resources.files("idam.demo")
+    with resources.as_file(folder / "source.ply") as source, resources.as_file(folder / "target.ply") as target:
+        clouds = read_point_cloud(source), read_point_cloud(target)
+    result = register(*clouds)
+    files = {"page": output / "demo.html", "aligned": output / "aligned.ply", "transform": output / "transform.txt"}
+    write_report(files["page"], *clouds, result, source_name="source.ply", target_name="target.ply")
+    write_point_cloud(files["aligned"], clouds[0].transformed(result.transformation))
+    write_transform(files["transform"], result.transformation)
+    return result, files

@@ -1,5 +1,0 @@
-"""The paper's figures (appendix B), drawn from the shipped weights."""
-
-from idam.figures.draw import draw_figures
-
-__all__ = ["draw_figures"]

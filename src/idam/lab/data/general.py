@@ -1,0 +1,234 @@
+"""Pairs of scans as practice has them: any rotation, other points, partial views, noise, strays; drawn without end.
+
+Where the paper's protocol crops two copies of the same points, here each scan samples the surface anew: a thing seen
+from a few viewpoints, a room, a street as a spinning LiDAR sees it, or half of a ModelNet40 shape's points. Both go
+through the same centring, scaling and voxel grid as in :func:`idam.register`, so that a network sees in training what
+it sees in use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from idam.clouds.frame import common_frame, without_strays
+from idam.clouds.pyramid import level
+from idam.errors import InputError
+from idam.io.files import one_line, silenced
+from idam.lab.data.practice import make_practice_pairs
+from idam.lab.data.surfaces import random_room, random_street, random_thing
+from idam.lab.data.visibility import seen_from_afar, seen_from_within
+
+__all__ = ["Material", "ScanPair", "draw_halves", "draw_scans", "load_meshes"]
+
+Points = NDArray[np.float64]
+Draw = Callable[["Material", np.random.Generator], "tuple[Points, Points] | None"]
+
+DENSE = 60_000
+"""Points of a thing before it is scanned; rooms and streets have twice as many."""
+FEWEST = 120
+"""Points of each scan at least."""
+COUNTS, SHARES = (600, 1000, 1500, 2000), (0.1, 0.25, 0.35, 0.3)
+"""Points of the larger scan, about, and how often each number is drawn."""
+NOISE, MUCH_NOISE = 0.008, 0.02
+"""Largest sigmas, in a thing's radii, of most pairs and of every fifth."""
+STRAYS = 0.006
+"""Largest share of points that are strays, in every third scan."""
+LEAST_OVERLAP, MORE_OVERLAP = 0.05, 0.2
+"""A pair is drawn again where it overlaps less than a share drawn from between these."""
+TOUCHING = 1.2
+"""Spacings within which surfaces overlap."""
+RANGE = 2.2
+"""How far a street's LiDAR sees."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """What surfaces are made of, besides our own: ModelNet40 shapes (S, N, 3), and trimesh meshes."""
+
+    shapes: NDArray[np.float32]
+    meshes: Sequence[Any] = ()
+
+
+@dataclass(frozen=True)
+class ScanPair:
+    """Two scans in working coordinates, ready for features.
+
+    Attributes:
+        source: (N, 3).
+        target: (P, 3).
+        transformation: the truth (4, 4), source to target.
+        spacing: of their points.
+        overlap: share of the cloud that overlaps less.
+    """
+
+    source: Points
+    target: Points
+    transformation: Points
+    spacing: float
+    overlap: float
+
+
+def load_meshes(folder: Path) -> list[Any]:
+    """The triangle meshes (``.ply``) of a folder; none where there is no such folder.
+
+    Raises:
+        InputError: one of them cannot be read, or has no surface.
+    """
+    return [_load_mesh(path) for path in sorted(folder.glob("*.ply"))]
+
+
+def _load_mesh(path: Path) -> Any:
+    import trimesh
+
+    try:
+        with silenced("trimesh"):
+            mesh: Any = trimesh.load(path, process=False)
+            area = float(getattr(mesh, "area", 0.0))
+    except Exception as error:  # there is no telling what parsers throw at a damaged file
+        raise InputError(
+            f"{path}: cannot be read as a mesh ({one_line(error)}); export it again, or remove it"
+        ) from None
+    if not 0 < area < np.inf:
+        raise InputError(f"{path}: is a mesh without area; export it with its faces, or remove it")
+    return mesh
+
+
+def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
+    """A pair of scans, a function of the generator's state."""
+    kinds: list[Draw] = [_halves, _views_of_a_thing, _views_of_a_room, _views_of_a_street]
+    while True:
+        drawn = kinds[rng.choice(len(kinds), p=(0.2, 0.45, 0.2, 0.15))](material, rng)
+        if drawn is None:
+            continue
+        pair = _as_scanned(*drawn, rng)
+        if pair is not None and pair.overlap >= rng.uniform(LEAST_OVERLAP, MORE_OVERLAP):
+            return pair
+
+
+def draw_halves(material: Material, rng: np.random.Generator) -> ScanPair:
+    """A pair of the practice protocol (:func:`idam.lab.data.practice.make_practice_pairs`), in any rotation."""
+    shape = torch.from_numpy(material.shapes[rng.integers(len(material.shapes))])[None]
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    pair = make_practice_pairs(shape, generator, math.pi)
+    truth = np.eye(4)
+    truth[:3, :3], truth[:3, 3] = pair.rotation[0].numpy(), pair.translation[0].numpy()
+    scans = _in_working_coordinates(
+        pair.source[0].double().numpy(), pair.target[0].double().numpy(), truth, max(COUNTS)
+    )
+    assert scans is not None  # no voxel grid leaves fewer of so few points
+    return scans
+
+
+def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """Disjoint halves of a shape's points, each cropped by a half-space; None where there are no shapes."""
+    if len(material.shapes) == 0:
+        return None
+    points = material.shapes[rng.integers(len(material.shapes))].astype(np.float64)
+    points = points[rng.permutation(len(points))]
+    first, second = np.array_split(points, 2)
+    return first[_below(first, 0.55, rng)], second[_below(second, 0.55, rng)]
+
+
+def _views_of_a_thing(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """A thing from all around, or as one or three viewpoints see it, those of the two scans 10 to 130 degrees apart."""
+    points = random_thing(DENSE, rng, material.meshes) @ Rotation.random(random_state=rng).as_matrix().T
+    axis = rng.normal(size=3)
+    apart = np.radians(rng.uniform(10, 130)) * axis / np.linalg.norm(axis)
+    first = Rotation.random(random_state=rng)
+    masks = []
+    around = rng.random() < 0.25
+    for side in (first, first * Rotation.from_rotvec(apart)):
+        if around:
+            masks.append(_below(points, 0.4, rng))
+            continue
+        number = rng.choice([1, 3], p=[0.7, 0.3])
+        views = [side * Rotation.from_rotvec(0.25 * rng.normal(size=3)) for _ in range(number)]
+        seen = np.any([seen_from_afar(points, view.as_matrix(), int(rng.integers(60, 110))) for view in views], 0)
+        masks.append(seen & _below(points, 0.5, rng) if rng.random() < 0.4 else seen)
+    return _sampled_apart(points, masks, rng)
+
+
+def _views_of_a_room(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """A room as a camera with a wide field of view sees it from one to three places."""
+    points, places = random_room(2 * DENSE, rng, material.meshes)
+    masks = []
+    for _ in range(2):
+        seen = np.zeros(len(points), bool)
+        for place in rng.permutation(places)[: rng.integers(1, 4)]:
+            look = rng.normal(size=3) * (1, 1, 0.4)
+            ray = points - place
+            ahead = ray @ look / (np.linalg.norm(ray, axis=1) * np.linalg.norm(look))
+            seen |= seen_from_within(points, place) & (ahead > np.cos(np.radians(rng.uniform(40, 90))))
+        masks.append(seen)
+    return _sampled_apart(points, masks, rng)
+
+
+def _views_of_a_street(_: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """A street as a spinning LiDAR sees it from two places: the farther, the sparser."""
+    points, places = random_street(2 * DENSE, rng)
+    first = int(rng.integers(len(places) - 2))
+    masks = []
+    for place in places[[first, first + int(rng.integers(1, 3))]]:
+        ray = points - place
+        distance = np.linalg.norm(ray, axis=1)
+        within = (distance < RANGE) & (ray[:, 2] < 0.25 * distance)
+        masks.append(seen_from_within(points, place) & within & (rng.random(len(points)) < 0.5 / distance**2))
+    return _sampled_apart(points, masks, rng)
+
+
+def _below(points: Points, least: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which points (N, 3) a random half-space keeps: a share of ``least`` or more."""
+    along = points @ rng.normal(size=3)
+    kept: NDArray[np.bool_] = along <= np.quantile(along, rng.uniform(least, 1))
+    return kept
+
+
+def _sampled_apart(
+    points: Points, masks: list[NDArray[np.bool_]], rng: np.random.Generator
+) -> tuple[Points, Points] | None:
+    """Two scans of dense points (N, 3) by what each sees; no point is in both. None where they see too little."""
+    first = rng.random(len(points)) < 0.5
+    source, target = points[masks[0] & first], points[masks[1] & ~first]
+    if min(len(source), len(target)) < 10 * FEWEST:
+        return None
+    if rng.random() < 0.3:
+        source = source[rng.random(len(source)) < rng.uniform(0.3, 1)]
+    return source, target
+
+
+def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> ScanPair | None:
+    """Turned, with noise and strays, and as :func:`idam.register` sees them; None where too few points are left."""
+    sigma = rng.uniform(0, NOISE if rng.random() < 0.8 else MUCH_NOISE)
+    truth = np.eye(4)
+    truth[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    clouds = []
+    for cloud in (source, target):
+        noisy = cloud + sigma * rng.normal(size=cloud.shape)
+        stray = rng.random(len(noisy)) < (rng.uniform(0, STRAYS) if rng.random() < 0.3 else 0.0)
+        noisy[stray] += 0.3 * rng.normal(size=(stray.sum(), 3))
+        clouds.append(noisy)
+    source, target = clouds[0], clouds[1] @ truth[:3, :3].T
+    return _in_working_coordinates(source, target, truth, int(rng.choice(COUNTS, p=SHARES)))
+
+
+def _in_working_coordinates(source: Points, target: Points, truth: Points, count: int) -> ScanPair | None:
+    """Clouds and the truth (4, 4) as :func:`idam.register` sees them; None where too few points are left."""
+    frame = common_frame(source, target)
+    scans = level(without_strays(frame.source(source)), without_strays(frame.target(target)), count)
+    if min(len(scans.source), len(scans.target)) < FEWEST:
+        return None
+    truth = frame.enter(truth)
+    reach = TOUCHING * scans.spacing
+    moved = scans.source @ truth[:3, :3].T + truth[:3, 3]
+    shares = [np.mean(cKDTree(a).query(b)[0] < reach) for a, b in ((scans.target, moved), (moved, scans.target))]
+    return ScanPair(scans.source, scans.target, truth, scans.spacing, float(min(shares)))

@@ -1,0 +1,78 @@
+"""The pairs of each step, and those that pick the checkpoint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from idam.lab.data.modelnet40 import Shapes
+from idam.lab.data.pairs import EXPERIMENTS, Pairs, fixed_pairs, make_pairs
+from idam.lab.data.practice import make_practice_pairs
+from idam.lab.training.recipe import Recipe
+from idam.network.elimination import share_of
+from idam.network.geometry import apply_transform
+from idam.network.sampling import balanced_sample
+
+__all__ = ["Batch", "batch_at", "generator_at", "pairs_at", "split_validation"]
+
+VALIDATION_SHAPES = 200
+VALIDATION_SEED = 7
+
+
+class Batch(NamedTuple):
+    """Pairs (:class:`idam.lab.data.pairs.Pairs`) and the rows (B, M) of each cloud that balanced sampling drew."""
+
+    source: Tensor
+    target: Tensor
+    rotation: Tensor
+    translation: Tensor
+    source_index: Tensor
+    target_index: Tensor
+
+
+def split_validation(shapes: Shapes, recipe: Recipe) -> tuple[Shapes, Pairs]:
+    """Shapes to train on, and fixed pairs of the 200 others (a tenth, where there are few) that pick the checkpoint."""
+    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed))
+    held = min(VALIDATION_SHAPES, max(1, len(shapes) // 10))
+    train = Shapes(shapes.points[order[held:]], shapes.labels[order[held:]])
+    points = shapes.points[order[:held]]
+    if recipe.experiment in EXPERIMENTS:
+        return train, fixed_pairs(points, VALIDATION_SEED, recipe.sigma)
+    return train, draw_pairs(points, recipe, torch.Generator().manual_seed(VALIDATION_SEED))
+
+
+def draw_pairs(points: Tensor, recipe: Recipe, generator: torch.Generator) -> Pairs:
+    """Pairs of whole shapes (B, N, 3) to train on."""
+    if recipe.experiment == "practice":
+        return make_practice_pairs(points, generator)
+    if recipe.experiment == "practice-any-rotation":
+        return make_practice_pairs(points, generator, recipe.max_angle)
+    return make_pairs(points, generator, recipe.sigma)
+
+
+def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -> Batch:
+    """The pairs and sampled points of one process at one step, a function of the seed and the step alone."""
+    generator = generator_at(recipe, step, rank)
+    pairs = pairs_at(shapes, recipe, step, generator, rank, world)
+    aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
+    count = share_of(pairs.source.shape[1], recipe.keep)
+    source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)
+    return Batch(pairs.source, pairs.target, pairs.rotation, pairs.translation, source_index, target_index)
+
+
+def generator_at(recipe: Recipe, step: int, rank: int = 0) -> torch.Generator:
+    """What all that is random about one process's step is drawn from, the pairs first."""
+    return torch.Generator().manual_seed((recipe.seed * 1_000_003 + step) * 4099 + rank)
+
+
+def pairs_at(
+    shapes: Shapes, recipe: Recipe, step: int, generator: torch.Generator, rank: int = 0, world: int = 1
+) -> Pairs:
+    """The pairs of one process at one step, drawn from its generator."""
+    per_epoch = len(shapes) // recipe.batch_size
+    epoch, position = divmod(step, per_epoch)
+    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
+    rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
+    return draw_pairs(shapes.points[rows], recipe, generator)

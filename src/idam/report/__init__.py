@@ -1,0 +1,1 @@
+"""A registration to look at: the page and the picture."""

@@ -1,0 +1,1 @@
+"""What is asked besides of sparse clouds, which share a surface and no points."""
