@@ -137,9 +137,8 @@ def _columns(image: Any, points: Any, count: int, number: int) -> dict[str, Numb
 
     prototype = pye57.libe57.StructureNode(points.prototype())
     names = [prototype.get(place).elementName() for place in range(prototype.childCount())]
-    kinds = pye57.libe57.NodeType
-    numeric = {kinds.E57_INTEGER, kinds.E57_SCALED_INTEGER, kinds.E57_FLOAT}
-    kept = [name for name in names if prototype[name].type() in numeric]
+    numeric = pye57.libe57.IntegerNode, pye57.libe57.ScaledIntegerNode, pye57.libe57.FloatNode
+    kept = [name for name in names if isinstance(prototype[name], numeric)]
     if len(kept) < len(names):
         log.info("left out fields of scan %d: %s", number, ", ".join(sorted(set(names) - set(kept))))
     size = min(count, _CHUNK)

@@ -33,6 +33,7 @@ MOST_POINTS = 10_000_000
 """Points past which a file is thinned while it is read, to every second, third and so on: registration sees 10^4 to
 10^6 of them, and memory stays bounded (measured in docs/formats.md)."""
 
+_OWN = "_"  # behind the name of an extra dimension where LAS has one of that name, of other numbers
 _CHUNK = 1_000_000
 _COLORS = ("red", "green", "blue")
 _COORDINATES = ("X", "Y", "Z")
@@ -65,7 +66,9 @@ def read(path: Path) -> PointCloud:
     zero = [name for name, values in columns.items() if name not in "xyz" and not values.any()]
     if set(_COLORS) & set(zero) != set(_COLORS):
         zero = [name for name in zero if name not in _COLORS]
-    return cloud_from_columns({name: values for name, values in columns.items() if name not in zero})
+    kept = {name: values for name, values in columns.items() if name not in zero}
+    own = {name: name.removesuffix(_OWN) for name in kept}  # what encode() could not put into LAS's own dimension
+    return cloud_from_columns({own[name] if own[name] in zero else name: values for name, values in kept.items()})
 
 
 def encode(cloud: PointCloud, compress: bool) -> bytes:
@@ -243,7 +246,7 @@ def _fits(header: Any, name: str, values: Numbers) -> bool:
 def _extra_name(name: str, known: set[str]) -> str:
     """A name of up to 32 bytes that no dimension of LAS's own has."""
     short = name.encode("ascii", "replace").decode()[:30] or "unnamed"
-    return f"{short}_" if short in known else short
+    return short + _OWN if short in known else short
 
 
 def _check_header(data: Any) -> bool:

@@ -30,7 +30,8 @@ __all__ = ["decode", "decode_pts", "encode_csv", "encode_pts", "encode_xyz"]
 
 _BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _SLASHES = re.compile(r"(^|[ \t,;])//", re.MULTILINE)
-_COMMENT = re.compile(r"(?:^|(?<=[\s,;]))#.*")
+_COMMENT = re.compile(r'("[^"]*")|(?:^|(?<=[\s,;]))#.*')
+_COMMA_BY_SPACE = re.compile(r",\s|\s,")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _BEFORE_EMPTY_FIELD = re.compile(r",(?=[ \t]*(?:,|$))", re.MULTILINE)
 _IN_BRACKETS = re.compile(r"\s*([\[({][^\])}]*[\])}])")
@@ -113,7 +114,7 @@ def _parse_header(lines: list[str]) -> _Header:
     from_comment = False
     for index, line in enumerate(lines):
         is_comment = line.lstrip().startswith("#")
-        line = line.lstrip(" \t#") if is_comment else _COMMENT.sub("", line)
+        line = line.lstrip(" \t#") if is_comment else _without_comment(line)
         words = _words(line)
         if not any(words) or (index == 0 and line.startswith("sep=")):  # which tells Excel the separator
             continue
@@ -144,11 +145,19 @@ def _names(line: str) -> list[str]:
 
 def _words(line: str) -> list[str]:
     """Split a line; an empty field between commas counts, so that names and numbers stay in step."""
-    separator = ";" if ";" in line else "," if "," in line and not _has_decimal_commas(line) else " "
+    separator = " "
+    if ";" in line:
+        separator = ";"
+    elif "," in line and not _has_decimal_commas(line):
+        separator = "\t" if "\t" in line and not _COMMA_BY_SPACE.search(line) else ","
     words = _split(line, separator)
     while words and not words[-1]:
         words.pop()
     return words
+
+
+def _without_comment(line: str) -> str:
+    return _COMMENT.sub(lambda match: match[1] or "", line)
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -223,7 +232,7 @@ def _plain_table(lines: list[str]) -> Numbers | None:
 
 def _decode_fields(lines: list[str], start: int, stop: int, header: _Header) -> PointCloud:
     """Read rows with quotes, text or unusual numbers: slower, field by field."""
-    numbered = [(at + 1, line) for at in range(start, stop) if (line := _COMMENT.sub("", lines[at]).strip())]
+    numbered = [(at + 1, line) for at in range(start, stop) if (line := _without_comment(lines[at]).strip())]
     separator = _separator([line for _, line in numbered])
     rows = [_split(line, separator) for _, line in numbered]
     widths = [len(row) for row in rows]
@@ -276,10 +285,10 @@ def _separator(lines: list[str]) -> str:
     outside = [re.sub(r'"[^"]*"', '""', line) for line in lines]
     if any(";" in line for line in outside):
         return ";"
+    if all("\t" in line for line in outside) and not any(map(_COMMA_BY_SPACE.search, outside)):
+        return "\t"
     if any("," in line for line in outside) and not all(map(_has_decimal_commas, outside)):
         return ","
-    if all("\t" in line for line in outside):
-        return "\t"
     return " "
 
 
