@@ -37,7 +37,7 @@ def register(
     max_correspondence_distance: Annotated[
         float | None, typer.Option(help="Distance for fitness and RMSE; from the data if left out.")
     ] = None,
-    refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point, symmetric or none.")] = "gicp",
+    refine: Annotated[Refinement, typer.Option(help="Fine alignment.")] = "gicp",
     seed: Annotated[int, typer.Option(help="Of the starting rotations.")] = 0,
     device: Annotated[str, typer.Option(help="Where the network runs.")] = "cpu",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the 4x4 alone, for scripts.")] = False,

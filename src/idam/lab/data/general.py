@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from idam.clouds.frame import common_frame, without_strays
-from idam.clouds.pyramid import level
+from idam import rigid
+from idam.clouds.prepared import Prepared
+from idam.clouds.pyramid import Pyramid
+from idam.clouds.surfaces import Surface
 from idam.errors import InputError
 from idam.io.files import one_line, silenced
 from idam.lab.data.practice import make_practice_pairs
@@ -223,12 +224,12 @@ def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> Sca
 
 def _in_working_coordinates(source: Points, target: Points, truth: Points, count: int) -> ScanPair | None:
     """Clouds and the truth (4, 4) as :func:`idam.register` sees them; None where too few points are left."""
-    frame = common_frame(source, target)
-    scans = level(without_strays(frame.source(source)), without_strays(frame.target(target)), count)
+    clouds = Pyramid(Prepared.of(source, "source"), Prepared.of(target, "target"))
+    scans = clouds.with_points(count)
     if min(len(scans.source), len(scans.target)) < FEWEST:
         return None
-    truth = frame.enter(truth)
-    reach = TOUCHING * scans.spacing
-    moved = scans.source @ truth[:3, :3].T + truth[:3, 3]
-    shares = [np.mean(cKDTree(a).query(b)[0] < reach) for a, b in ((scans.target, moved), (moved, scans.target))]
+    truth = clouds.enter(truth)
+    moved = rigid.apply(truth, scans.source)
+    there, back = scans.surfaces.target.nearest(moved)[0], Surface.of(moved).nearest(scans.target)[0]
+    shares = [np.mean(distance < TOUCHING * scans.spacing) for distance in (there, back)]
     return ScanPair(scans.source, scans.target, truth, scans.spacing, float(min(shares)))

@@ -22,7 +22,7 @@ TEST_SEED = 1
 """Of the test pairs: with the index, all that they depend on."""
 
 TABLES = (*EXPERIMENTS, "ablation", "practice", "practice-any-rotation")
-"""The paper's experiments, its ablation, and disjoint halves (:mod:`idam.lab.data.practice`) turned little or anyhow."""
+"""The paper's experiments, its ablation, and disjoint halves (:mod:`idam.lab.data.practice`), small or any rotation."""
 
 AXISYMMETRIC = (5, 6, 9, 10, 15, 19, 34, 37)
 """Labels of bottle, bowl, cone, cup, flower_pot, lamp, tent and vase, whose turn about their axis no one can see."""

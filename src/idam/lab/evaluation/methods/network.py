@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from idam.align import Refinable, Surfaces, align, reaches
-from idam.clouds.pyramid import spacing_of
+from idam.align import align, reaches
+from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.errors import InputError
 from idam.lab.evaluation.methods import ABLATION, RIVALS, Method
 from idam.lab.evaluation.methods.learned.weights import rival_weights_for
@@ -35,11 +35,11 @@ def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
     network = gnn(model, settings)
 
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
-        moving, fixed = (Refinable.build(cloud.astype(np.float64)) for cloud in (source, target))
-        surfaces = Surfaces(moving, fixed, max(spacing_of(cloud.points) for cloud in (moving, fixed)))
+        moving, fixed = source.astype(np.float64), target.astype(np.float64)
+        surfaces = Surfaces(Surface.of(moving), Surface.of(fixed), max(spacing_of(moving), spacing_of(fixed)))
         transformation = network(source, target)
         for reach in reaches("symmetric"):
-            transformation, _ = align(surfaces, transformation, reach, "symmetric")
+            transformation = align(surfaces, transformation, reach, "symmetric")
         return transformation
 
     return run
