@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from idam import rigid
+from idam.describe.products import product
 from idam.rigid import Array
 from idam.search.matching import FeatureMatches
 
@@ -79,7 +80,7 @@ def _second_order_compatibility(source: Array, target: Array, tolerance: float) 
     first, second = (np.sqrt(((x[:, None] - x) ** 2).sum(-1)) for x in (source, target))
     compatible = (np.abs(first - second) < tolerance).astype(np.float32)
     np.fill_diagonal(compatible, 0)
-    second_order: NDArray[np.float32] = compatible * (compatible @ compatible)
+    second_order: NDArray[np.float32] = compatible * product(compatible, compatible)
     return second_order
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from idam import rigid
 from idam.clouds.prepared import Describes
 from idam.clouds.pyramid import PairLevel
+from idam.describe.products import product
 from idam.rigid import Array, Rows
 
 __all__ = ["FeatureMatches", "Matching", "mutual_matches"]
@@ -68,7 +69,7 @@ class Matching:
     def of(cls, descriptor: Describes, clouds: PairLevel) -> Matching:
         """By the features of a descriptor: their inner products, over the root of their length."""
         source, target = clouds.features(descriptor)
-        score = source @ target.T / np.float32(source.shape[1] ** 0.5)
+        score = product(source, target.T) / np.float32(source.shape[1] ** 0.5)
         row, column = _log_sums(score)
         i, j = mutual_matches(score, row, column)
         matches = FeatureMatches(clouds.source[i], clouds.target[j], TOLERANCE * clouds.spacing)
