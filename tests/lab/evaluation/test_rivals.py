@@ -31,7 +31,8 @@ from idam.lab.evaluation.methods.pointnetlk import PointNetLK, pseudo_inverse
 from idam.lab.evaluation.methods.prnet import Config, PRNet, keypoints, straight_through
 from idam.network.features.gnn import neighbour_graph
 from idam.network.geometry import apply_transform, compose, invert, rotation_angle, weighted_procrustes
-from idam.network.pretrained import provenance, save_weights
+from idam.network.pretrained import save_weights
+from idam.weights import provenance
 
 SIZES = {"neighbours": 8, "widths": (16, 32), "heads": 2, "feed_forward": 32}
 SMALL: dict[str, Callable[[], Rival]] = {
