@@ -348,7 +348,7 @@ def test_settings_are_the_network_s(tmp_path):
 def trainer() -> ModuleType:
     """benchmarks/train_rival.py."""
     pytest.importorskip("tensorboard", reason="training needs TensorBoard")
-    path = Path(__file__).parents[2] / "benchmarks" / "train_rival.py"
+    path = Path(__file__).parents[3] / "benchmarks" / "train_rival.py"
     spec = importlib.util.spec_from_file_location("train_rival", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules["train_rival"] = module  # its dataclasses look themselves up
