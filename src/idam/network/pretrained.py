@@ -19,12 +19,12 @@ from idam.errors import InputError
 from idam.io.files import write_bytes
 from idam.network.config import Config
 from idam.network.model import IDAM
-from idam.weights import UNREADABLE, find, list_models, not_a_model, provenance, read_weights, without_denormals
+from idam.weights import UNREADABLE, find, not_a_model, read_weights, without_denormals
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["cached_model", "find", "list_models", "load_model", "provenance", "restore", "save_model", "save_weights"]
+__all__ = ["cached_model", "load_model", "restore", "save_model", "save_weights"]
 
 
 def load_model(name: str | os.PathLike[str] = "default", device: str | torch.device | None = None) -> IDAM:
