@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from idam.clouds.frame import core, without_strays
 from idam.clouds.surfaces import Surface, spacing_of
+from idam.clouds.viewpoint import DepthMap
 from idam.clouds.voxels import downsample, ladder, rung, rung_for
 from idam.describe.invariant import Descriptor, surroundings
 from idam.rigid import Array
@@ -105,6 +107,12 @@ class Prepared:
     def base(self) -> Level:
         """The points that all levels are thinned from, :data:`BASE` at most."""
         return self.level(self.voxel_size(BASE))
+
+    @cached_property
+    def depth(self) -> DepthMap | None:
+        """How far the scan sees from its frame's origin, around the centre in input units; None for no single scan."""
+        points = self._centred()
+        return DepthMap.of(points[:: len(points) // BASE + 1], -self.centre)
 
     def voxel_size(self, count: int) -> float:
         """The voxel size of the ladder that leaves at most ``count`` points, :data:`ALL` where there are no more."""

@@ -25,6 +25,9 @@ ITERATIONS = 12
 """Of the refinement before an answer is scored: right ones have come near by then, wrong ones may never."""
 UNLIKELY = 0.05
 """Overlap counts for so much where the features do not speak for an answer: on flat ground they say nothing."""
+VIOLATION, MOST_VIOLATION = 0.002, 0.02
+"""Share of points where the other scan saw through that halves a score; and the most that counts, since scans of
+moving objects and bleeding edges have some in the right pose."""
 MIXED = 2.0
 """How fast the score of sparse clouds' answers falls with :func:`idam.search.sparse.border.mixing`. The features of
 dense clouds say enough, and what a scanner sees of them does not end at a plane."""
@@ -42,6 +45,7 @@ class Answer:
             (:meth:`idam.search.matching.Matching.likelihood`).
         border: 1 where what only one cloud shows lies past where the other ends, less where it lies amid the other
             (:func:`idam.search.sparse.border.mixing`), of sparse clouds.
+        violation: share of the points that lie where the other scan saw through, in [0, 1].
     """
 
     transformation: Array
@@ -49,11 +53,13 @@ class Answer:
     support: float = 0.0
     likelihood: float = 0.0
     border: float = 1.0
+    violation: float = 0.0
 
     @property
     def score(self) -> float:
         """What answers are ranked by: surfaces slid into wrong contact overlap, too, but their points are not alike."""
-        return (max(self.likelihood, 0.0) + UNLIKELY * self.overlap) * self.border
+        explained = max(self.likelihood, 0.0) + UNLIKELY * self.overlap
+        return explained * self.border / (1 + min(self.violation, MOST_VIOLATION) / VIOLATION)
 
 
 def improve(transformations: Iterable[Array], matching: Matching, reach: float, method: str) -> list[Answer]:
@@ -69,7 +75,8 @@ def scored(transformation: Array, matching: Matching, *, sparse: bool) -> Answer
     border = math.exp(-MIXED * mixing(surfaces, transformation)) if sparse else 1.0
     support = matching.matches.support(transformation)
     shared = overlap(surfaces, transformation)
-    return Answer(transformation, shared, support, matching.likelihood(transformation), border)
+    likelihood, violation = matching.likelihood(transformation), matching.clouds.free_space.violation(transformation)
+    return Answer(transformation, shared, support, likelihood, border, violation)
 
 
 def likeliest(transformations: Array, matching: Matching, most: int) -> Array:

@@ -19,6 +19,7 @@ from idam.search.consensus import agreeing_transforms
 from idam.search.matching import Matching
 from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, same
 from idam.search.scope import Scope
+from idam.search.slides import slides
 
 __all__ = ["Found", "Network", "search"]
 
@@ -33,6 +34,8 @@ HYPOTHESES = 64
 """Different transforms, among those that the sets agree on, whose likelihood is asked for."""
 EXAMINED = 8
 """The likeliest of them, which are refined."""
+SLID = 6
+"""The likeliest of the poses that the best answer may be mistaken for, which are refined, too."""
 CONTENDERS = 6
 """Answers that are kept, and that stay in the race against what larger clouds say."""
 TAUGHT = 90.0
@@ -151,7 +154,12 @@ def choose(network: Network, found: Found, agreed: Array, matching: Matching, sc
 def explain(candidates: Array, matching: Matching, scope: Scope, method: str) -> Found:
     """What the likeliest of the candidates (S, 4, 4) come to: refined, scored and looked at closely."""
     tried = likeliest(candidates[distinct(candidates, HYPOTHESES)], matching, EXAMINED)
-    answers = ranked(improve(tried, matching, reaches(method)[0], method))[:CONTENDERS]
+    answers = ranked(improve(tried, matching, reaches(method)[0], method))
+    mistaken = scope.within(slides(matching.clouds.surfaces, answers[0].transformation))
+    if len(mistaken):
+        slid = likeliest(mistaken, matching, SLID)
+        answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
+    answers = answers[:CONTENDERS]
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
     return Found(least_turned(answers, scope.guess), matching)
 
