@@ -18,13 +18,12 @@ from idam.lab.data.general import (
     COUNTS,
     FEWEST,
     LEAST_OVERLAP,
-    TOUCHING,
     Material,
-    ScanPair,
     draw_scans,
     load_meshes,
 )
 from idam.lab.data.surfaces import random_blob
+from idam.lab.data.working import TOUCHING, ScanPair
 
 KINDS = ["_halves", "_views_of_a_thing", "_views_of_a_room", "_views_of_a_street"]
 kinds = pytest.mark.parametrize("kind", KINDS)

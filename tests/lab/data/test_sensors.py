@@ -20,7 +20,6 @@ from idam.lab.data.sensor_pairs import (
     SensorPair,
     draw_part_in_whole,
     draw_sensor_pair,
-    overlap_of,
 )
 from idam.lab.data.sensors import SENSORS, Sensor, draw_sensor
 from idam.rigid import apply, exp
@@ -363,13 +362,6 @@ def test_an_object_unlike_scenery_moves_where_the_slide_is_taken():
 def _close(pair: SensorPair, transformation: np.ndarray) -> float:
     """Share of the source within 4 cm of the target."""
     return float(np.mean(cKDTree(pair.target).query(apply(transformation, pair.source))[0] < 0.04))
-
-
-def test_overlap_is_the_smaller_share():
-    half = np.random.default_rng(0).uniform(size=(400, 3))
-    both = np.concatenate([half, half + np.array([5.0, 0, 0])])
-    assert overlap_of(half, both, np.eye(4), 0.01) == 0.5
-    assert overlap_of(both, half, np.eye(4), 0.01) == 0.5
 
 
 def test_views_of_meshes_lie_on_the_whole():

@@ -13,20 +13,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from idam.clouds.frame import common_frame, without_strays
-from idam.clouds.pyramid import level
+from idam.clouds.prepared import SMALL
 from idam.lab.data.drilled import Drilled, random_drilled, random_flange
 from idam.lab.data.parts import random_part, sample_surface
 from idam.lab.data.raycast import cast, cast_drilled, depth_image
 from idam.lab.data.scenes import SCENES, Scene, Symmetry, about, draw_scene
 from idam.lab.data.sensors import RAYS, Sensor, draw_sensor
 from idam.lab.data.surfaces import unit, warp
+from idam.lab.data.working import as_registered
 from idam.rigid import adjoint, apply, inverse, transform
 
-__all__ = ["FAMILIES", "SensorPair", "draw_part_in_whole", "draw_sensor_pair", "overlap_of"]
+__all__ = ["FAMILIES", "SensorPair", "draw_part_in_whole", "draw_sensor_pair"]
 
 Array = NDArray[np.float64]
 
@@ -38,10 +37,6 @@ SEEN, UNSEEN, SHARE = 30, 3, 0.004
 """Points that show an object; points that do not; and the share of a scan that all that fixes its place makes up."""
 LEAST_OVERLAP = 0.1
 """Below, pairs are drawn again."""
-TOUCHING = 1.2
-"""Spacings within which surfaces overlap."""
-LEVEL = 1024
-"""Points of the larger scan at which the overlap is measured: about what :func:`idam.register` matches."""
 SAME = 0.65
 """Share of pairs whose scans are from the same sensor."""
 WHOLE = (3000, 20_000)
@@ -78,16 +73,7 @@ class SensorPair:
     @cached_property
     def overlap(self) -> float:
         """Share of the scan that overlaps less, where both are as sparse as they are matched."""
-        frame = common_frame(self.source, self.target)
-        scans = level(without_strays(frame.source(self.source)), without_strays(frame.target(self.target)), LEVEL)
-        return overlap_of(scans.source, scans.target, frame.enter(self.transformation), scans.spacing)
-
-
-def overlap_of(source: Array, target: Array, transformation: Array, spacing: float) -> float:
-    """The smaller of the shares of (N, 3) and (P, 3) with a point of the other near by, under the truth (4, 4)."""
-    moved, reach = apply(transformation, source), TOUCHING * spacing
-    shares = [np.mean(cKDTree(a).query(b)[0] < reach) for a, b in ((target, moved), (moved, target))]
-    return float(min(shares))
+        return as_registered(self.source, self.target, self.transformation, SMALL).overlap
 
 
 def draw_sensor_pair(rng: np.random.Generator, family: str | None = None) -> SensorPair:
