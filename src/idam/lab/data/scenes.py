@@ -18,7 +18,7 @@ __all__ = ["SCENES", "Scene", "Symmetry", "draw_scene"]
 
 Array = NDArray[np.float64]
 
-OBJECTS, HOW_OFTEN = (0, 1, 2, 4, 8, 16), (0.3, 0.1, 0.1, 0.15, 0.2, 0.15)
+OBJECTS, HOW_OFTEN = (0, 1, 2, 4, 8, 16), (0.22, 0.1, 0.1, 0.16, 0.22, 0.2)
 """Objects that fix the place, along some twenty metres, and how often there are so many."""
 WALL = 0.3
 """Thickness of walls and slabs."""
