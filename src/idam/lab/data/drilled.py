@@ -84,10 +84,10 @@ def _on_surface(solid: Solid, areas: Array, density: float, rng: np.random.Gener
 
 
 def random_drilled(rng: np.random.Generator) -> Drilled:
-    """A block or plate with up to five blocks, ribs and bosses on it, and up to six holes, slots and pockets."""
+    """A block or plate with one to five blocks, ribs and bosses on it, and up to six holes, slots and pockets."""
     half = np.sort(rng.uniform(0.15, 0.8, 3))[::-1] * (1, 1, rng.uniform(0.2, 1))
     solids = [Solid("box", np.zeros(3), half, np.eye(3))]
-    for _ in range(rng.integers(0, 6)):
+    for _ in range(rng.integers(1, 6)):
         base = solids[int(rng.integers(len(solids)))]
         axis, side = int(rng.integers(3)), rng.choice([-1, 1])
         size = rng.uniform(0.05, 0.5, 3)
