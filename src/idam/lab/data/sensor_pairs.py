@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from idam.clouds.prepared import SMALL
 from idam.lab.data.drilled import Drilled, random_drilled, random_flange
 from idam.lab.data.parts import random_part, sample_surface
-from idam.lab.data.raycast import cast, cast_drilled, depth_image
+from idam.lab.data.raycast import Solid, cast, cast_drilled, depth_image
 from idam.lab.data.scenes import SCENES, Scene, Symmetry, about, draw_scene
 from idam.lab.data.sensors import RAYS, Sensor, draw_sensor
 from idam.lab.data.surfaces import unit, warp
@@ -169,46 +169,16 @@ def draw_part_in_whole(rng: np.random.Generator, meshes: Sequence[Any] = ()) -> 
 
 def _draw_part(rng: np.random.Generator, family: str, meshes: Sequence[Any] = ()) -> SensorPair | None:
     """None where the view shows too little, or not whether a flange has a key."""
-    count, width = int(rng.integers(*WHOLE)), int(np.sqrt(rng.uniform(*RAYS)))
-    order, key = 0, None
-    part: Drilled | None = None
-    if family == "flange":
-        part, order, key = random_flange(rng)
-    elif rng.random() < DRILLED:
-        part = random_drilled(rng)
-    mesh: Any = _random_mesh(rng, meshes) if part is None else None
-    whole = sample_surface(mesh, count, rng) if part is None else part.sample(count, rng)
-
+    part, order, key = random_flange(rng) if family == "flange" else (_random_part(rng, meshes), 0, None)
+    count = int(rng.integers(*WHOLE))
+    whole = part.sample(count, rng) if isinstance(part, Drilled) else sample_surface(part, count, rng)
     middle = (whole.min(0) + whole.max(0)) / 2
     radius = float(np.linalg.norm(whole - middle, axis=1).max())
-    axes = Rotation.random(random_state=rng).as_matrix()  # the camera's, as columns: it looks along the third
-    away = radius * rng.uniform(2.5, 6)
-    pose = transform(axes, middle - away * axes[:, 2])
-    across = 1.03 * radius / np.sqrt(away**2 - radius**2) * np.linspace(-1, 1, width)
-    rays = np.stack([*np.meshgrid(across, across), np.ones((width, width))], -1).reshape(-1, 3)
-    lengths = np.linalg.norm(rays, axis=1)
-    rays /= lengths[:, None]
-    if part is None:
-        distance = depth_image(apply(inverse(pose), mesh.triangles.reshape(-1, 3)).reshape(-1, 3, 3), across).ravel()
-        distance *= lengths
-    else:
-        distance = cast_drilled(part.solids, part.holes, pose[:3, 3], rays @ axes.T)
-    camera = Sensor("camera", rays, 0.0, np.inf, radius * 0.01 * rng.random() ** 2, image=width)
-    if rng.random() < SHARP:
-        camera = replace(camera, image=None)
-    measured = camera.measure(distance, rng)
-    back = np.isfinite(measured)
-    view = rays[back] * measured[back, None]
-    if len(view) < FEWEST:
+    view, pose = _view(part, middle, radius, rng)
+    if len(view) < FEWEST or (key is not None and not _shows(key, apply(pose, view))):
         return None
-
-    free: tuple[Symmetry, ...] = ()
-    if family == "flange" and key is None:
-        free = (about((0, 0, 1), (0, 0, 0), order or None),)
-    elif key is not None:
-        seen = replace(key, half=1.05 * key.half).holds(apply(pose, view)).sum()
-        if seen < max(SEEN, SHARE * len(view)):
-            return None
+    turns = family == "flange" and key is None
+    free: tuple[Symmetry, ...] = (about((0, 0, 1), (0, 0, 0), order or None),) if turns else ()
     scale = np.exp(rng.uniform(*np.log(EXTENTS))) / radius
     pose[:3, 3] *= scale
     view, whole = scale * view, scale * whole
@@ -219,10 +189,40 @@ def _draw_part(rng: np.random.Generator, family: str, meshes: Sequence[Any] = ()
     return SensorPair(view, whole, pose, family, free, ("camera", "model"))
 
 
-def _random_mesh(rng: np.random.Generator, meshes: Sequence[Any]) -> Any:
-    """One of the meshes, bent, or a part of primitives stuck into each other."""
+def _view(part: Any, middle: Array, radius: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A part within a ball as a depth camera sees it from somewhere: points (N, 3) in its frame, its pose (4, 4)."""
+    width = int(np.sqrt(rng.uniform(*RAYS)))
+    axes = Rotation.random(random_state=rng).as_matrix()  # as columns; the camera looks along the third
+    away = radius * rng.uniform(2.5, 6)
+    pose = transform(axes, middle - away * axes[:, 2])
+    across = 1.03 * radius / np.sqrt(away**2 - radius**2) * np.linspace(-1, 1, width)
+    rays = np.stack([*np.meshgrid(across, across), np.ones((width, width))], -1).reshape(-1, 3)
+    lengths = np.linalg.norm(rays, axis=1)
+    rays /= lengths[:, None]
+    if isinstance(part, Drilled):
+        distance = cast_drilled(part.solids, part.holes, pose[:3, 3], rays @ axes.T)
+    else:
+        triangles = apply(inverse(pose), np.asarray(part.triangles).reshape(-1, 3)).reshape(-1, 3, 3)
+        distance = depth_image(triangles, across).ravel() * lengths
+    sigma = radius * 0.01 * rng.random() ** 2
+    camera = Sensor("camera", rays, 0.0, np.inf, sigma, image=None if rng.random() < SHARP else width)
+    measured = camera.measure(distance, rng)
+    back = np.isfinite(measured)
+    return rays[back] * measured[back, None], pose
+
+
+def _shows(key: Solid, points: Array) -> bool:
+    """Whether enough of a view's points (N, 3) are on a flange's key."""
+    seen = replace(key, half=1.05 * key.half).holds(points).sum()
+    return bool(seen >= max(SEEN, SHARE * len(points)))
+
+
+def _random_part(rng: np.random.Generator, meshes: Sequence[Any]) -> Any:
+    """A drilled part, a mesh of primitives stuck into each other, or one of the meshes, bent."""
     import trimesh
 
+    if rng.random() < DRILLED:
+        return random_drilled(rng)
     if not meshes or rng.random() < 0.3:
         return random_part(rng)
     mesh = meshes[int(rng.integers(len(meshes)))]
