@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from idam.lab.data import sensor_pairs
 from idam.lab.data.drilled import random_drilled, random_flange
 from idam.lab.data.raycast import Ground, Solid, cast, cast_drilled, depth_image
-from idam.lab.data.scenes import SCENES, Scene, draw_scene
+from idam.lab.data.scene import Scene
+from idam.lab.data.scenes import SCENES, draw_scene
 from idam.lab.data.sensor_pairs import (
     FAMILIES,
     FEWEST,

@@ -19,7 +19,8 @@ from idam.clouds.prepared import SMALL
 from idam.lab.data.drilled import Drilled, random_drilled, random_flange
 from idam.lab.data.parts import random_part, sample_surface
 from idam.lab.data.raycast import Solid, cast, cast_drilled, depth_image
-from idam.lab.data.scenes import SCENES, Scene, Symmetry, about, draw_scene
+from idam.lab.data.scene import Scene, Symmetry, about
+from idam.lab.data.scenes import SCENES, draw_scene
 from idam.lab.data.sensors import RAYS, Sensor, draw_sensor
 from idam.lab.data.surfaces import unit, warp
 from idam.lab.data.working import as_registered
