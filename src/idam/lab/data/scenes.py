@@ -40,6 +40,11 @@ def apart(rng: np.random.Generator, near: float, far: float, across: float, heig
     return places
 
 
+def steps(scene: Scene, period: float) -> int:
+    """How often what repeats has to stand on either side, so that no sensor sees the last."""
+    return int(scene.length / period) + 2
+
+
 def how_many(rng: np.random.Generator) -> int:
     """Objects that fix the place."""
     return int(rng.choice(OBJECTS, p=HOW_OFTEN))
@@ -79,7 +84,7 @@ def pillars(rng: np.random.Generator) -> Scene:
     scene = Scene(rng.uniform(15, 30), places, (), ("spinning", "terrestrial", "rosette"))
     period, shift, kind = rng.uniform(1.5, 5), rng.random(), rng.integers(3)
     width, out, low = rng.uniform(0.25, 0.4 * period), rng.uniform(0.12, 0.4), rng.uniform(0.8, 1.2)
-    number = int(scene.length / period)
+    number = steps(scene, period)
     for x in period * (np.arange(-number, number + 1) + shift):
         for side in (-1, 1):
             y = side * (half - out / 2)
@@ -110,7 +115,7 @@ def tunnel(rng: np.random.Generator) -> Scene:
     turn = about(UP, (0, 0, 0))
     if rng.random() < 0.35:
         period, shift, out = rng.uniform(4, 12), rng.random(), rng.uniform(0.15, 0.5)
-        number = int(scene.length / period)
+        number = steps(scene, period)
         for x in period * (np.arange(-number, number + 1) + shift):
             scene.add("box", (x, 0, radius - floor - out / 2), (1.0, 0.5, out))
         along, turn = repeat(period), about(UP, (period * shift, 0, 0))
@@ -150,7 +155,7 @@ def road(rng: np.random.Generator) -> Scene:
     along, turn = slide(1), about(UP, (0, 0, 0))
     if not concrete and rng.random() < 0.5:
         period, shift = rng.uniform(2, 4), rng.random()
-        number = int(scene.length / period)
+        number = steps(scene, period)
         for x in period * (np.arange(-number, number + 1) + shift):
             for side in sides:
                 scene.add("box", (x, side * (half + 0.12), top / 2), (0.12, 0.12, top))
@@ -189,7 +194,7 @@ def stairwell(rng: np.random.Generator) -> Scene:
     places = apart(rng, 0.8, 5, 0.3 * half, (1.0, 1.6))
     places[:, 2] += places[:, 0] * rise / run
     scene = Scene(rng.uniform(6, 10), places, (), ("spinning", "terrestrial", "camera"))
-    number = int(scene.length / run) + 1
+    number = steps(scene, run)
     for n in range(-number, number + 1):
         scene.add("box", (n * run, 0, n * rise - 0.5), (run, 2 * half, 1.0))
     slope = np.arctan2(rise, run)
@@ -245,7 +250,7 @@ def parking(rng: np.random.Generator) -> Scene:
     places = apart(rng, 1, 20, 0.4 * half, (0.5, 2.2))
     scene = Scene(rng.uniform(20, 40), places, (), ("spinning", "terrestrial", "rosette"), ground=Ground.flat())
     size, shift, both = car_size(rng), rng.random(), rng.random() < 0.6
-    count, number = how_many(rng), int(scene.length / period)
+    count, number = how_many(rng), steps(scene, period)
     odd = set(rng.choice(np.arange(-8, 9), min(count, 17), replace=False).tolist())
     for n in range(-number, number + 1):
         for side in (-1, 1) if both else (1,):
@@ -274,7 +279,7 @@ def street(rng: np.random.Generator) -> Scene:
         return scene
     depth, height, door = rng.uniform(0.2, 1.2), rng.uniform(4, 10), rng.uniform(-0.3, 0.3) * period
     wide = rng.uniform(0.3, 0.5) * period
-    number = int(scene.length / period)
+    number = steps(scene, period)
     for side in (-1, 1):
         scene.add("box", (0, side * (half + 2), height / 2), (2 * scene.length, 4, height))
         for x in period * (np.arange(-number, number + 1) + side * shift):
@@ -305,7 +310,7 @@ def forest(rng: np.random.Generator) -> Scene:
     scene = Scene(rng.uniform(15, 30), places, (), ("spinning", "terrestrial", "rosette"), ground=Ground.flat())
     if rng.random() < 0.25:
         step, width = rng.uniform(2.5, 5, 2), rng.uniform(0.15, 0.4)
-        across, along = (int(scene.length / s) + 1 for s in (step[1], step[0]))
+        across, along = (steps(scene, size) for size in (step[1], step[0]))
         for n in range(-along, along):
             for m in range(-across, across):
                 scene.add("cylinder", ((n + 0.5) * step[0], (m + 0.5) * step[1], 4), (width, width, 8))
