@@ -26,6 +26,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -185,14 +186,10 @@ def summary(records: list[dict[str, Any]]) -> dict[str, float]:
     return figures
 
 
-def table(families: dict[str, dict[str, float]]) -> str:
-    """One line for each family."""
-    columns = list(next(iter(families.values())))
-    lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-    for name, figures in families.items():
-        cells = [str(value) if isinstance(value, int) else f"{value:.2f}" for value in figures.values()]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def line(name: str, cells: list[Any]) -> str:
+    """Of a table."""
+    texts = [f"{cell:.2f}" if isinstance(cell, float) else str(cell) for cell in cells]
+    return f"| {name} | " + " | ".join(texts) + " |"
 
 
 def main() -> None:
@@ -204,15 +201,20 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write every pair's record here")
     arguments = parser.parse_args()
-    records = []
     sets = [drawn(family, arguments.pairs, arguments.seed) for family in arguments.family or FAMILIES]
-    for cases in sets + [measured(folder) for folder in arguments.folders]:
-        for case in cases:
-            records.append(register(case))
-    names = dict.fromkeys(record["family"] for record in records)
-    families = {name: summary([record for record in records if record["family"] == name]) for name in names}
+    sets += [measured(folder) for folder in arguments.folders]
+    records: list[dict[str, Any]] = []
+    families: dict[str, dict[str, float]] = {}
+    for name, cases in groupby(chain.from_iterable(sets), key=lambda case: case.family):
+        found = [register(case) for case in cases]
+        families[name] = summary(found)
+        if not records:
+            columns = list(families[name])
+            print(line("", columns), "|---" * (len(columns) + 1) + "|", sep="\n")
+        print(line(name, list(families[name].values())), flush=True)
+        records += found
     families["all"] = summary(records)
-    print(table(families))
+    print(line("all", list(families["all"].values())))
     if arguments.json is not None:
         about = {
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
