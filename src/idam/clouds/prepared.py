@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +153,7 @@ class Prepared:
         Raises:
             InputError: the file cannot be written.
         """
-        arrays = {"points": self.points, "centre": self.centre}
+        arrays: dict[str, NDArray[Any]] = {"points": self.points, "centre": self.centre}
         sizes = sorted(self.levels)
         for number, size in enumerate(sizes):
             level = self.levels[size]

@@ -156,8 +156,7 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
     Two that started apart may be one that had not come to rest.
     """
     contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
-    if method != "none":
-        contenders = [verified(answer, matching, fine, method) for answer in contenders]
+    contenders = [verified(answer, matching, fine, method) for answer in contenders]
     rest = answers[len(contenders) :]
     return first_of_its_kind([*sorted(contenders, key=lambda answer: -answer.score), *rest])
 
