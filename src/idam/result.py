@@ -16,7 +16,7 @@ from idam import rigid
 from idam.clouds.surfaces import nearest_within
 from idam.errors import InputError
 from idam.rigid import Array, Rows
-from idam.search.confidence import Evidence
+from idam.search.judge import Evidence
 
 __all__ = ["Hypothesis", "Matches", "RegistrationResult", "chance"]
 

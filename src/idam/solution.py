@@ -14,7 +14,7 @@ from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
 from idam.result import Hypothesis, Matches
 from idam.rigid import Array
-from idam.search.confidence import Evidence
+from idam.search.judge import Evidence
 from idam.search.scope import Scope
 from idam.search.stages import search
 

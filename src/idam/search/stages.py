@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,8 +15,8 @@ from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
 from idam.rigid import Array
-from idam.search.confidence import CLOSE, Evidence, confidence
 from idam.search.consensus import agreeing_transforms
+from idam.search.judge import Evidence, confidence, evidence, weight
 from idam.search.matching import Matching
 from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, verified
 from idam.search.scope import Scope
@@ -46,6 +47,8 @@ VERIFIED = 4
 """Answers at most that are refined on the fine clouds before one is chosen."""
 CONTENDS = 0.3
 """Share of the best score from which on an answer is refined on the fine clouds, too."""
+TIED = 0.2
+"""Logits by which answers are as likely as the best: a symmetric object's poses differ by chance."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -67,12 +70,10 @@ class Found:
         """The transform (4, 4) to give."""
         return self.answers[0].transformation
 
-    @property
+    @cached_property
     def evidence(self) -> Evidence:
         """What speaks for the best answer."""
-        best, second = self.answers[0], max((answer.score for answer in self.answers[1:]), default=0.0)
-        margin = max(0.0, 1.0 - second / best.score) if best.score > 0 else 0.0
-        return Evidence(best.overlap, best.support, best.likelihood, margin)
+        return evidence(self.answers)
 
     @property
     def weights(self) -> Array:
@@ -158,7 +159,7 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
     contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
     contenders = [verified(answer, matching, fine, method) for answer in contenders]
     rest = answers[len(contenders) :]
-    return first_of_its_kind([*sorted(contenders, key=lambda answer: -answer.score), *rest])
+    return first_of_its_kind([*sorted(contenders, key=lambda answer: -weight(answer)), *rest])
 
 
 def to_match(clouds: Pyramid) -> Iterator[tuple[PairLevel, int]]:
@@ -174,10 +175,10 @@ def first_of_its_kind(answers: list[Answer]) -> list[Answer]:
 
 
 def least_turned(answers: list[Answer], guess: Array) -> list[Answer]:
-    """The answers, first the one nearest to the guess of those that explain the clouds as well as the best.
+    """The answers, first the one nearest to the guess of those that are as likely to be right as the best.
 
     Something has to choose among the poses of a symmetric object, and scans stand upright more often than not.
     """
-    tied = [answer for answer in answers if answer.score >= (1 - CLOSE) * answers[0].score]
+    tied = [answer for answer in answers if weight(answer) >= weight(answers[0]) - TIED]
     first = min(tied, key=lambda answer: float(rigid.angle(guess[:3, :3].T @ answer.transformation[:3, :3])))
     return [first, *(answer for answer in answers if answer is not first)]
