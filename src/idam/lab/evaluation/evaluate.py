@@ -46,6 +46,8 @@ def evaluate(
     """
     if settings and len(methods or ()) != 1:
         raise InputError("settings are of one method: give --set with one --method")
+    if model is not None and methods and not any(map(has_weights, methods)):
+        raise InputError(f"{', '.join(methods)} takes no weights: leave --model out")
     if resume and output is None:
         raise InputError("give --resume with --json, the file to go on with")
     tasks = [Task(name, _weights(name, model, test.name), tuple(settings)) for name in methods or rows_of(test.name)]

@@ -12,22 +12,25 @@ from torch import nn
 from idam.align import Refinable, Surfaces, align, reaches
 from idam.clouds.pyramid import spacing_of
 from idam.errors import InputError
-from idam.lab.evaluation.methods import ABLATION, RIVALS, Method
-from idam.lab.evaluation.methods.learned.weights import rival_weights_for
+from idam.lab.evaluation.methods import ABLATION, Method
 from idam.lab.settings import with_settings
 from idam.network.pretrained import list_models, load_model
 
 __all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
 
 
+INFERENCE = ("iterations", "keep", "keep_again", "trusted", "keep_matches", "soft_matches")
+"""What may be set of a trained network; the rest is built in, and setting it would change nothing."""
+
+
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
     """The network on GNN features; ``gnn-unseen-shapes`` unless another model is named."""
-    return _alone(model or "gnn-unseen-shapes", settings)
+    return _alone("gnn", model or "gnn-unseen-shapes", settings)
 
 
 def fpfh(model: str | None, settings: Sequence[str]) -> Method:
     """The network on FPFH features; ``fpfh-unseen-shapes`` unless another model is named."""
-    return _alone(model or "fpfh-unseen-shapes", settings)
+    return _alone("fpfh", model or "fpfh-unseen-shapes", settings)
 
 
 def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
@@ -53,13 +56,11 @@ def ablation(model: str | None, settings: Sequence[str]) -> Method:
     """
     if model is None:
         raise InputError("name the model, such as gnn-ablation-bs: a row of the ablation has weights of its own")
-    return _alone(model, settings)
+    return _alone("gnn", model, settings)
 
 
 def weights_for(method: str, experiment: str | None) -> str | None:
-    """The weights trained for an experiment, where the method is a rival, or the network alone and there are any."""
-    if method in RIVALS:
-        return rival_weights_for(method, experiment)
+    """The weights trained for an experiment, where the method is the network alone and there are any."""
     if method in ABLATION:
         name = f"gnn-{method}"
     elif "-idam" in method:
@@ -69,9 +70,14 @@ def weights_for(method: str, experiment: str | None) -> str | None:
     return name if name in list_models() else None
 
 
-def _alone(model: str, settings: Sequence[str]) -> Method:
+def _alone(features: str, model: str, settings: Sequence[str]) -> Method:
     network = load_model(model)
-    network.config = with_settings(network.config, settings)
+    if network.config.features != features:
+        raise InputError(
+            f"{model} has {network.config.features} features, which this method is not about: give --model a network "
+            f"of {features} features, or use --method register"
+        )
+    network.config = with_settings(network.config, settings, INFERENCE)
     return as_method(network)
 
 
