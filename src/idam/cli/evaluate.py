@@ -31,7 +31,11 @@ def evaluate(
         typer.Option(help="Rows to compute, or your own package.module:function; all rows if left out."),
     ] = None,
     model: Annotated[
-        str | None, typer.Option(help="Weights for the learned rows; those trained for the experiment if left out.")
+        str | None,
+        typer.Option(
+            help="Weights for the learned rows; those trained for the experiment if left out. Of the ablation, the "
+            "folder that benchmarks/ablation.py wrote, or that IDAM_ABLATION names."
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None,

@@ -46,6 +46,32 @@ def built(monkeypatch) -> list[tuple]:
     return calls
 
 
+@pytest.fixture
+def ablated(tmp_path, monkeypatch) -> Path:
+    """A folder of weights of the ablation, which stand-ins for methods do not open."""
+    folder = tmp_path / "ablation"
+    folder.mkdir()
+    for name in ABLATION:
+        (folder / f"gnn-{name}.safetensors").touch()
+    monkeypatch.setenv("IDAM_ABLATION", str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_the_ablation_s_rows_take_their_weights_from_one_folder(named, test, built, ablated, monkeypatch):
+    if named:
+        monkeypatch.delenv("IDAM_ABLATION")
+    rows = evaluate(dataclasses.replace(test, name="ablation"), model=str(ablated) if named else None)
+    assert [row.task.model for row in rows] == [str(ablated / f"gnn-{name}.safetensors") for name in ABLATION]
+
+
+def test_without_them_the_command_that_makes_them_is_named_before_any_work(test, built, tmp_path):
+    for model in (None, str(tmp_path / "nowhere"), str(tmp_path / "mine.safetensors")):
+        with pytest.raises(InputError, match=r"no such weights.*benchmarks/ablation\.py FOLDER.*IDAM_ABLATION"):
+            evaluate(dataclasses.replace(test, name="ablation"), model=model)
+    assert built == []
+
+
 def test_all_rows_are_computed_and_those_that_cannot_be_say_why(test, built, tmp_path):
     rows = evaluate(test, output=tmp_path / "out.json")
     assert [row.task.method for row in rows] == rows_of("unseen-shapes")
@@ -134,7 +160,7 @@ def test_settings_need_one_method_and_resuming_a_file(test, built):
 
 
 @pytest.mark.parametrize("experiment", PAPER)
-def test_the_paper_s_figures_stand_beside_ours(experiment, test, built):
+def test_the_paper_s_figures_stand_beside_ours(experiment, test, built, ablated):
     name = rows_of(experiment)[-1] if experiment == "ablation" else "icp"
     (row,) = evaluate(TestSet(experiment, test.pairs, "1234"), [name])
     console = Console(width=200)

@@ -19,7 +19,8 @@ PAPER = ("iterations=3", f"keep={1 / 6}", "keep_again=", "keep_matches=0.5", "so
 """The paper's inference, whatever a model's own."""
 
 ABLATION = ("ablation-bs", "ablation-sm", "ablation-ha-sm", "ablation-full")
-"""Rows of the ablation (section 4.6): the baseline, and one part more with each."""
+"""Rows of the ablation (section 4.6): the baseline, and one part more with each. The package has no weights for them:
+``benchmarks/ablation.py`` makes them."""
 
 WITHOUT_WEIGHTS = ("classical", "go_icp", "kiss")
 """Modules of methods that nothing is learnt for."""
