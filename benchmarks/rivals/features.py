@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from idam.lab.evaluation.methods.learned.attention import Transformer
-from idam.lab.evaluation.methods.learned.dgcnn import DGCNN
-from idam.lab.evaluation.methods.learned.rival import Estimate
 from idam.network.geometry import weighted_procrustes
+
+from .attention import Transformer
+from .dgcnn import DGCNN
+from .rival import Estimate
 
 __all__ = ["FeatureConfig", "Features", "procrustes", "similarity"]
 

@@ -12,13 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from idam.lab.data.pairs import Pairs
-from idam.lab.evaluation.methods import Method
-from idam.lab.evaluation.methods.learned.rival import Estimate, Rival, build_rival
-from idam.lab.evaluation.methods.learned.twist import twist_to_transform
 from idam.network.geometry import apply_transform, compose, gather_points
 from idam.network.layers import NormalisedLinear
 
-__all__ = ["Config", "Loss", "PointNet", "PointNetLK", "build", "pseudo_inverse"]
+from .rival import Estimate, Rival
+from .twist import twist_to_transform
+
+__all__ = ["Config", "Loss", "PointNet", "PointNetLK", "pseudo_inverse"]
 
 DAMPING = 1e-6
 """Share of the mean diagonal that keeps J^T J invertible."""
@@ -156,8 +156,3 @@ def pseudo_inverse(jacobian: Tensor) -> Tensor:
     damped = normal + DAMPING * size * torch.eye(6, dtype=normal.dtype, device=normal.device)
     inverse: Tensor = torch.linalg.solve(damped, jacobian.mT)
     return inverse
-
-
-def build(model: str | None, settings: Sequence[str]) -> Method:
-    """PointNetLK with weights for unseen shapes unless others are named."""
-    return build_rival(PointNetLK, model, settings)

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from idam.errors import InputError
 from idam.lab.data.pairs import Pairs
-from idam.lab.evaluation.methods import Method
-from idam.lab.evaluation.methods.learned.weights import find_rival_weights
-from idam.lab.evaluation.methods.network import as_method
-from idam.lab.settings import with_settings
-from idam.network.pretrained import restore
-from idam.weights import UNREADABLE, read_weights
 
 if TYPE_CHECKING:
     from idam.lab.training.log import Parts
 
-__all__ = ["Estimate", "Rival", "build_rival", "load_rival", "motion_errors"]
+__all__ = ["Estimate", "Rival", "motion_errors"]
 
 
 class Estimate(NamedTuple):
@@ -55,33 +47,6 @@ class Rival(nn.Module, ABC):
     @abstractmethod
     def loss(self, pairs: Pairs) -> Parts:
         """The loss of a batch of pairs, a mean over them, by its parts."""
-
-
-R = TypeVar("R", bound=Rival)
-
-
-def load_rival(rival: type[R], model: str | None) -> R:
-    """A rival with its weights, in evaluation mode (:func:`.weights.find_rival_weights`).
-
-    Raises:
-        InputError: the file is missing, or not one of this rival's.
-        MissingDependencyError: the weights are still to be trained.
-    """
-    path = find_rival_weights(rival.name, model)
-    try:
-        config, weights = read_weights(path)
-        network = rival(rival.configuration(**config))
-        restore(network, weights)
-    except UNREADABLE as error:
-        raise InputError(f"{path}: not a model of {rival.name} ({str(error).splitlines()[0][:120]})") from None
-    return network.eval().requires_grad_(False)
-
-
-def build_rival(rival: type[Rival], model: str | None, settings: Sequence[str]) -> Method:
-    """A rival with its weights, as a method."""
-    network = load_rival(rival, model)
-    network.config = with_settings(network.config, settings)
-    return as_method(network)
 
 
 def motion_errors(estimate: Estimate, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:

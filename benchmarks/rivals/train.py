@@ -1,6 +1,6 @@
 """Train a learned rival on the pairs that IDAM is trained on, for a given time or number of epochs.
 
-    python benchmarks/train_rival.py {pointnetlk,dcp,prnet} EXPERIMENT --data DIR --output FOLDER --minutes 120
+    python -m benchmarks.rivals.train {pointnetlk,dcp,prnet} EXPERIMENT --data DIR --output FOLDER --minutes 120
 
 Shapes, pairs and the held-out validation split are those of ``idam train`` with the same seed. ``best.safetensors`` is
 the model with the least validation MAE(R), ``last.ckpt`` what ``--resume`` goes on from; minutes count over all
@@ -25,11 +25,6 @@ from idam.errors import InputError, MissingDependencyError
 from idam.io import make_folder
 from idam.lab.data.modelnet40 import experiment_shapes
 from idam.lab.data.pairs import Pairs
-from idam.lab.evaluation.methods.dcp import DCP
-from idam.lab.evaluation.methods.learned.features import Features
-from idam.lab.evaluation.methods.learned.rival import Rival
-from idam.lab.evaluation.methods.pointnetlk import PointNetLK
-from idam.lab.evaluation.methods.prnet import PRNet
 from idam.lab.training.batches import generator_at, pairs_at, split_validation
 from idam.lab.training.checkpoint import Progress, history, restore, save_checkpoint
 from idam.lab.training.log import Log
@@ -39,7 +34,10 @@ from idam.lab.training.recipe import TRAININGS, Recipe, check
 from idam.lab.training.task import PairTask, validate
 from idam.network.pretrained import save_weights
 
-RIVALS: dict[str, type[Rival]] = {rival.name: rival for rival in (PointNetLK, DCP, PRNet)}
+from .features import Features
+from .methods import RIVALS
+from .rival import Rival
+
 DROPS = (0.3, 0.6, 0.8)
 VALIDATION_BATCH = 20
 
@@ -223,7 +221,7 @@ def main(words: list[str] | None = None) -> None:
             resume=arguments.resume,
             device=arguments.device,
             validate_every=arguments.validate_every,
-            command=shlex.join(["python", "benchmarks/train_rival.py", *(words or sys.argv[1:])]),
+            command=shlex.join(["python", "-m", "benchmarks.rivals.train", *(words or sys.argv[1:])]),
         )
     except (InputError, MissingDependencyError) as error:
         parser.error(str(error))

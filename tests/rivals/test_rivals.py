@@ -1,8 +1,7 @@
 """The learned rivals: shapes and gradients, their parts against other ways to the same, learning, weights, training."""
 
-import importlib.util
+import importlib
 import math
-import sys
 from collections.abc import Callable
 from itertools import count, pairwise
 from pathlib import Path
@@ -11,24 +10,27 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from benchmarks.rivals import prnet
+from benchmarks.rivals.attention import Attention
+from benchmarks.rivals.dcp import DCP
+from benchmarks.rivals.dgcnn import DGCNN, EdgeConv, largest_neighbour
+from benchmarks.rivals.features import FeatureConfig, Features, procrustes
+from benchmarks.rivals.methods import RIVALS, load_rival
+from benchmarks.rivals.pointnetlk import Config as LKConfig
+from benchmarks.rivals.pointnetlk import PointNetLK, pseudo_inverse
+from benchmarks.rivals.prnet import Config, PRNet, keypoints, straight_through
+from benchmarks.rivals.rival import Rival
+from benchmarks.rivals.twist import twist_to_transform
 from torch import Tensor
 
-from idam.errors import InputError, MissingDependencyError
+from idam.errors import InputError
 from idam.lab.data import pairs as protocol
 from idam.lab.data.pairs import Pairs, make_pairs
 from idam.lab.evaluation.evaluate import evaluate
 from idam.lab.evaluation.experiments import TestSet
-from idam.lab.evaluation.methods import RIVALS, build_method, prnet
-from idam.lab.evaluation.methods.dcp import DCP
-from idam.lab.evaluation.methods.learned.attention import Attention
-from idam.lab.evaluation.methods.learned.dgcnn import DGCNN, EdgeConv, largest_neighbour
-from idam.lab.evaluation.methods.learned.features import FeatureConfig, Features, procrustes
-from idam.lab.evaluation.methods.learned.rival import Rival
-from idam.lab.evaluation.methods.learned.twist import twist_to_transform
-from idam.lab.evaluation.methods.network import weights_for
-from idam.lab.evaluation.methods.pointnetlk import Config as LKConfig
-from idam.lab.evaluation.methods.pointnetlk import PointNetLK, pseudo_inverse
-from idam.lab.evaluation.methods.prnet import Config, PRNet, keypoints, straight_through
+from idam.lab.evaluation.methods import build_method
+from idam.lab.evaluation.paper import PAPER
+from idam.lab.evaluation.table import columns
 from idam.network.features.gnn import neighbour_graph
 from idam.network.geometry import apply_transform, compose, invert, rotation_angle, weighted_procrustes
 from idam.network.pretrained import save_weights
@@ -40,6 +42,7 @@ SMALL: dict[str, Callable[[], Rival]] = {
     "dcp": lambda: DCP(FeatureConfig(**SIZES)),
     "prnet": lambda: PRNet(Config(**SIZES, keypoints=48, iterations=2)),
 }
+METHOD = {name: f"benchmarks.rivals.methods:{name}" for name in RIVALS}
 each_rival = pytest.mark.parametrize("name", RIVALS)
 
 
@@ -284,77 +287,61 @@ def test_iterations_add_up(pairs, close):
         close(one, other)
 
 
-# weights
+# as methods of the evaluation
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
-    """The folder of the rivals' weights, with those of one for one experiment."""
-    monkeypatch.setenv("IDAM_RIVALS", str(tmp_path))
-    network = SMALL["dcp"]()
-    save_weights(tmp_path / "dcp-gaussian-noise.safetensors", network, network.config, {})
-    return tmp_path
+def weights(tmp_path) -> Callable[[str], Path]:
+    """Saves a small rival."""
 
+    def save(name: str) -> Path:
+        network = SMALL[name]()
+        save_weights(tmp_path / f"{name}.safetensors", network, network.config, {})
+        return tmp_path / f"{name}.safetensors"
 
-def test_weights_are_found_by_experiment_or_path_and_answer_as_saved(folder, pairs):
-    network = SMALL["dcp"]().eval()
-    save_weights(folder / "mine.safetensors", network, network.config, {})
-    clouds = pairs.source[0].numpy(), pairs.target[0].numpy()
-    found = build_method("dcp", str(folder / "mine.safetensors"))(*clouds)
-    rotation, translation = network(pairs.source[:1], pairs.target[:1])
-    np.testing.assert_allclose(found[:3, :3], rotation[0].detach(), atol=1e-6)
-    np.testing.assert_allclose(found[:3, 3], translation[0].detach(), atol=1e-6)
-    assert build_method("dcp", "dcp-gaussian-noise")(*clouds).shape == (4, 4)
-
-
-def test_the_evaluation_takes_the_weights_of_the_experiment(folder, pairs):
-    (row,) = evaluate(TestSet("gaussian-noise", pairs[:2], "1"), ["dcp"])
-    assert row.task.model == "dcp-gaussian-noise"
-    (row,) = evaluate(TestSet("practice", pairs[:2], "1"), ["dcp"], model=str(folder / f"{row.task.model}.safetensors"))
-    assert row.task.model.endswith("dcp-gaussian-noise.safetensors")
-    assert weights_for("dcp", "practice") is None
-    (folder / "dcp-practice.safetensors").touch()
-    assert weights_for("dcp", "practice") == "dcp-practice"
+    return save
 
 
 @each_rival
-def test_without_weights_the_command_that_trains_them_is_named(name, folder):
-    for model, experiment in ((None, "unseen-shapes"), (f"{name}-unseen-categories", "unseen-categories")):
-        with pytest.raises(MissingDependencyError, match=rf"train_rival\.py {name} {experiment} ") as caught:
-            build_method(name, model)
-        assert "\n" not in str(caught.value)
+def test_a_rival_is_a_row_of_the_evaluation(name, weights, pairs):
+    path = weights(name)
+    (row,) = evaluate(TestSet("gaussian-noise", pairs[:2], "1"), [f"benchmarks.rivals.methods:{name}"], model=str(path))
+    assert (row.task.model, row.pairs) == (str(path), 2)
+    assert columns("gaussian-noise")["method"](row) == f"{name} ({path})"
+    paper = PAPER["gaussian-noise"][name]
+    assert columns("gaussian-noise")["RMSE(R)"](row).endswith(f"({paper[0]:g})")
 
 
-def test_what_is_no_weights_of_the_rival_is_refused(folder):
-    for model in ("sift", "missing.safetensors"):
-        with pytest.raises(InputError, match="unknown model"):
-            build_method("dcp", model)
+def test_its_answer_is_the_network_s(weights, pairs):
+    path = weights("dcp")
+    network = load_rival("dcp", str(path))
+    found = build_method(METHOD["dcp"], str(path))(pairs.source[0].numpy(), pairs.target[0].numpy())
+    rotation, translation = network(pairs.source[:1], pairs.target[:1])
+    np.testing.assert_allclose(found[:3, :3], rotation[0], atol=1e-6)
+    np.testing.assert_allclose(found[:3, 3], translation[0], atol=1e-6)
+
+
+@each_rival
+@pytest.mark.parametrize("model", [None, "missing.safetensors"])
+def test_without_weights_the_command_that_trains_them_is_named(name, model):
+    with pytest.raises(InputError, match=rf"rivals\.train {name} ") as caught:
+        build_method(METHOD[name], model)(*np.zeros((2, 40, 3), np.float32))
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_of_another_rival_are_refused(weights):
     with pytest.raises(InputError, match="not a model of prnet"):
-        build_method("prnet", str(folder / "dcp-gaussian-noise.safetensors"))
-
-
-def test_settings_are_the_network_s(tmp_path):
-    network = SMALL["prnet"]()
-    save_weights(tmp_path / "small.safetensors", network, network.config, {})
-    build_method("prnet", str(tmp_path / "small.safetensors"), ["iterations=1"])
-    with pytest.raises(InputError, match="iterations"):
-        build_method("prnet", str(tmp_path / "small.safetensors"), ["tries=1"])
+        load_rival("prnet", str(weights("dcp")))
 
 
 # training
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def trainer() -> ModuleType:
-    """benchmarks/train_rival.py."""
+    """benchmarks/rivals/train.py."""
     pytest.importorskip("tensorboard", reason="training needs TensorBoard")
-    path = Path(__file__).parents[3] / "benchmarks" / "train_rival.py"
-    spec = importlib.util.spec_from_file_location("train_rival", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["train_rival"] = module  # its dataclasses look themselves up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["train_rival"]
+    return importlib.import_module("benchmarks.rivals.train")
 
 
 @pytest.fixture
@@ -395,9 +382,10 @@ def test_a_training_leaves_weights_that_tell_how_they_came_about(name, fit):
         "method": name, "experiment": "unseen-shapes", "batch_size": 4, "precision": "32", "seed": 3
     }  # fmt: skip
     assert told["steps"] == 3
-    assert told["command"].startswith(f"python benchmarks/train_rival.py {name} unseen-shapes --data")
+    assert told["command"].startswith(f"python -m benchmarks.rivals.train {name} unseen-shapes --data")
     assert told["validation"]["mae_r"] > 0
-    assert build_method(name, str(output / "best.safetensors"))(*np.random.rand(2, 40, 3).astype("f")).shape == (4, 4)  # noqa: NPY002
+    clouds = np.random.default_rng(0).random((2, 40, 3), np.float32)
+    assert build_method(METHOD[name], str(output / "best.safetensors"))(*clouds).shape == (4, 4)
 
 
 def test_a_resumed_training_ends_with_the_same_bits(fit, trainer, monkeypatch):

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from torch import Tensor
 
 from idam.lab.data.pairs import Pairs
-from idam.lab.evaluation.methods import Method
-from idam.lab.evaluation.methods.learned.features import FeatureConfig, Features, procrustes, similarity
-from idam.lab.evaluation.methods.learned.rival import Estimate, Rival, build_rival, motion_errors
 
-__all__ = ["DCP", "Loss", "build"]
+from .features import FeatureConfig, Features, procrustes, similarity
+from .rival import Estimate, Rival, motion_errors
+
+__all__ = ["DCP", "Loss"]
 
 
 class Loss(NamedTuple):
@@ -47,8 +46,3 @@ class DCP(Rival):
     def loss(self, pairs: Pairs) -> Loss:
         """The loss of B pairs."""
         return Loss(*motion_errors(self(pairs.source, pairs.target), pairs.rotation, pairs.translation))
-
-
-def build(model: str | None, settings: Sequence[str]) -> Method:
-    """DCP-v2 with weights for unseen shapes unless others are named."""
-    return build_rival(DCP, model, settings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,12 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from idam.lab.data.pairs import Pairs
-from idam.lab.evaluation.methods import Method
-from idam.lab.evaluation.methods.learned.features import FeatureConfig, Features, procrustes, similarity
-from idam.lab.evaluation.methods.learned.rival import Estimate, Rival, build_rival, motion_errors
 from idam.network.geometry import apply_transform, compose, gather_points, invert
 
-__all__ = ["Config", "Loss", "PRNet", "build", "keypoints", "straight_through"]
+from .features import FeatureConfig, Features, procrustes, similarity
+from .rival import Estimate, Rival, motion_errors
+
+__all__ = ["Config", "Loss", "PRNet", "keypoints", "straight_through"]
 
 DISCOUNT = 0.9
 """Of each further iteration's loss (equation 12)."""
@@ -173,8 +172,3 @@ def straight_through(scores: Tensor, temperature: Tensor, *, noisy: bool) -> Ten
     hard = torch.zeros_like(soft).scatter_(-1, scores.argmax(-1, keepdim=True), 1.0)
     matches: Tensor = hard + (soft - soft.detach())
     return matches
-
-
-def build(model: str | None, settings: Sequence[str]) -> Method:
-    """PRNet with weights for unseen shapes unless others are named."""
-    return build_rival(PRNet, model, settings)
