@@ -22,16 +22,12 @@ and exchanging the two points turns (a, b) into (-b, -a) and leaves c and the de
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from idam.describe.neighbours import Neighbours, Reach, nearest_neighbours, within_reach
+from idam.describe.neighbours import Array, Neighbours, Reach, nearest_neighbours, within_reach
 
 __all__ = ["BINS", "fpfh", "fpfh_from_neighbours"]
-
-Array = NDArray[Any]
 
 BINS = 11
 # Angles (radians) closer than this count as equal where the outcome jumps: on flat surfaces they often are, and then

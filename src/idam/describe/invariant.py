@@ -16,19 +16,16 @@ Here is the forward pass, in NumPy. :class:`idam.network.features.invariant.Inva
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from idam.describe.fpfh import fpfh_from_neighbours
-from idam.describe.neighbours import Reach, nearest_neighbours, within_reach
+from idam.describe.neighbours import Array, Reach, nearest_neighbours, within_reach
 from idam.describe.normals import normal_reach, normals_from_neighbours
 from idam.describe.products import product
 
 __all__ = ["FAR", "NEIGHBOURS", "PERCENT", "STRIDES", "Descriptor", "Surroundings", "pair_features", "surroundings"]
-
-Array = NDArray[Any]
 
 NORMALS = normal_reach(2.5, 30)
 """Whom a normal is taken from: those within 2.5 spacings."""
@@ -124,7 +121,9 @@ class Descriptor:
         for layer, near in zip(self._layers, around.near, strict=True):
             x = layer(x, near, pair_features(around.points, around.normals, near))
         x = self._last(x)
-        return self._length * x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), np.float32(1e-12))
+        norm = np.maximum(np.linalg.norm(x, axis=1, keepdims=True), np.float32(1e-12))
+        features: Array = self._length * x / norm
+        return features
 
 
 class _Affine:

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Neighbours", "Reach", "nearest_neighbours", "within_reach"]
+__all__ = ["Array", "Neighbours", "Reach", "nearest_neighbours", "within_reach"]
 
 Array = NDArray[Any]
+"""Numbers as they come: coordinates and features in float32 or float64, rows of points in whole numbers."""
 
 
 class Reach(NamedTuple):

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from idam.describe.neighbours import Neighbours, Reach, nearest_neighbours, within_reach
+from idam.describe.neighbours import Array, Neighbours, Reach, nearest_neighbours, within_reach
 
 __all__ = ["estimate_normals", "normal_reach", "normals_from_neighbours"]
-
-Array = NDArray[Any]
 
 # Points, itself included, that a normal is taken from where the radius holds fewer: any fewer span no plane.
 FEWEST_POINTS = 3
@@ -128,24 +124,29 @@ def _smallest_eigenvalue(matrix: Array) -> Array:
 
 def _cross(a: Array, b: Array) -> Array:
     """Cross products of vectors (..., 3); ``np.cross`` takes several times as long."""
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    product: Array = a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    return product
 
 
 def _longest(vectors: Array) -> Array:
     """Longest (N, 3) of three vectors (N, 3, 3), given as rows."""
-    return vectors[np.arange(len(vectors)), np.square(vectors).sum(-1).argmax(-1)]
+    longest: Array = vectors[np.arange(len(vectors)), np.square(vectors).sum(-1).argmax(-1)]
+    return longest
 
 
 def _norm(vector: Array) -> Array:
     """Lengths (..., 1) of vectors (..., 3)."""
-    return np.sqrt(np.square(vector).sum(-1, keepdims=True))
+    length: Array = np.sqrt(np.square(vector).sum(-1, keepdims=True))
+    return length
 
 
 def _unit(vector: Array) -> Array:
     """Vectors (..., 3) scaled to length one, zero vectors left as they are."""
-    return vector / np.maximum(_norm(vector), TINY)
+    unit: Array = vector / np.maximum(_norm(vector), TINY)
+    return unit
 
 
 def _without(vector: Array, direction: Array) -> Array:
     """Vectors (N, 3) less their part along a unit or zero ``direction`` (N, 3)."""
-    return vector - (vector * direction).sum(-1, keepdims=True) * direction
+    rest: Array = vector - (vector * direction).sum(-1, keepdims=True) * direction
+    return rest

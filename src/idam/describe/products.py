@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from idam.describe.neighbours import Array
 
 __all__ = ["product"]
-
-Array = NDArray[Any]
 
 SMALL = 2**18
 """Multiplications up to which OpenBLAS takes one thread (its 65536 times GEMM_MULTITHREAD_THRESHOLD)."""

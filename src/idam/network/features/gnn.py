@@ -15,11 +15,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from idam.network.features.normals import nearest_neighbours_of
+from idam.describe.neighbours import nearest_neighbours as nearest_by_tree
 from idam.network.geometry import nearest_neighbours
 from idam.network.layers import NormalisedLinear
 
@@ -40,7 +41,8 @@ def neighbour_graph(points: Tensor, k: int) -> Tensor:
     if points.is_cuda:
         near = nearest_neighbours(points, k)
     else:
-        near = torch.stack([nearest_neighbours_of(cloud, k)[1] for cloud in points])
+        clouds = points.detach().double().numpy()
+        near = torch.from_numpy(np.stack([nearest_by_tree(cloud, k)[1] for cloud in clouds]))
     return (near + offset).view(-1, k).t().contiguous()
 
 

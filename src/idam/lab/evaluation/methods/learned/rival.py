@@ -15,7 +15,8 @@ from idam.lab.evaluation.methods import Method
 from idam.lab.evaluation.methods.learned.weights import find_rival_weights
 from idam.lab.evaluation.methods.network import as_method
 from idam.lab.settings import with_settings
-from idam.network.pretrained import UNREADABLE, read_weights
+from idam.network.pretrained import restore
+from idam.weights import UNREADABLE, read_weights
 
 if TYPE_CHECKING:
     from idam.lab.training.log import Parts
@@ -68,9 +69,9 @@ def load_rival(rival: type[R], model: str | None) -> R:
     """
     path = find_rival_weights(rival.name, model)
     try:
-        config, state = read_weights(path)
+        config, weights = read_weights(path)
         network = rival(rival.configuration(**config))
-        network.load_state_dict(state)
+        restore(network, weights)
     except UNREADABLE as error:
         raise InputError(f"{path}: not a model of {rival.name} ({str(error).splitlines()[0][:120]})") from None
     return network.eval().requires_grad_(False)
