@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from idam import cli
+from idam.cli.shared import tell
 from idam.lab import training
 from idam.lab.data.modelnet40 import experiment_shapes
 from idam.lab.data.pairs import Pairs
@@ -405,7 +406,7 @@ def test_figures_are_drawn_with_the_options_given(idam, trainable, tmp_path, mon
     assert (outcome.code, outcome.out) == (0, "a\n")
     ((args, options),) = asked
     assert args == (tmp_path, trainable)
-    assert options.pop("progress") is cli.tell
+    assert options.pop("progress") is tell
     assert options == {"scans": [Path("a.ply"), Path("b.ply")], "speed": Path("s.json"), "model": "mine"}
 
 
