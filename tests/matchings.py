@@ -9,7 +9,7 @@ from idam.clouds.pyramid import PairLevel
 from idam.clouds.voxels import downsample, ladder, rung_for
 from idam.search.matching import FeatureMatches, Matching
 from motions import move
-from shapes import distances
+from solids import distances
 
 TOLERANCE = 0.02
 NO_MATCHES = FeatureMatches(np.empty((0, 3)), np.empty((0, 3)), TOLERANCE)

@@ -1,91 +1,76 @@
-"""Points on surfaces that several tests register, sampled evenly."""
+"""Clouds sampled from surfaces, written out in NumPy."""
 
-from __future__ import annotations
+from collections.abc import Callable
 
 import numpy as np
 
-Corners = list[tuple[list[float], list[float]]]
+from idam import rigid
 
-BRACKET: Corners = [
-    ([0, 0, 0], [1, 0.5, 0.12]),
-    ([0, 0, 0.12], [0.15, 0.5, 0.82]),
-    ([0.55, 0.1, 0.12], [0.8, 0.3, 0.47]),
-    ([0.8, 0.35, 0.12], [0.9, 0.45, 0.27]),
-]
-"""Lowest and highest corners of the boxes of a part without symmetry, about one unit long."""
+Points = np.ndarray
 
 
-def boxes(corners: Corners, count: int, seed: int) -> np.ndarray:
-    """Points (count, 3) on the faces of boxes."""
-    random = np.random.default_rng(seed)
-    low, size = np.array([c[0] for c in corners], float), np.array([np.subtract(c[1], c[0]) for c in corners])
-    area = np.repeat(np.stack([size[:, 1] * size[:, 2], size[:, 2] * size[:, 0], size[:, 0] * size[:, 1]], 1), 2, 1)
-    face = random.choice(area.size, count, p=(area / area.sum()).ravel())
-    box, face = np.divmod(face, 6)
-    at = random.uniform(size=(count, 3))
-    at[np.arange(count), face // 2] = face % 2
-    points: np.ndarray = low[box] + at * size[box]
-    return points
+def sphere(rng: np.random.Generator, count: int) -> Points:
+    points = rng.standard_normal((count, 3))
+    return 0.6 * points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def box(size: tuple[float, float, float], count: int, seed: int) -> np.ndarray:
-    """Points on one box about the origin."""
-    half = np.array(size) / 2
-    return boxes([((-half).tolist(), half.tolist())], count, seed)
+def torus(rng: np.random.Generator, count: int) -> Points:
+    a, b = rng.uniform(0, 2 * np.pi, (2, count))
+    ring = 0.7 + 0.25 * np.cos(b)
+    return np.stack([ring * np.cos(a), ring * np.sin(a), 0.25 * np.sin(b)], 1)
 
 
-def bracket(count: int, seed: int) -> np.ndarray:
-    """Points on a part without symmetry, about one unit long."""
-    return boxes(BRACKET, count, seed)
+def box(rng: np.random.Generator, count: int, size: tuple[float, ...] = (1.0, 0.8, 0.6)) -> Points:
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    axis = rng.integers(3, size=count)
+    points[np.arange(count), axis] = rng.choice([-0.5, 0.5], count)
+    return points * size
 
 
-def ball(count: int, seed: int) -> np.ndarray:
-    """Points on the unit sphere."""
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    normalised: np.ndarray = points / np.linalg.norm(points, axis=1, keepdims=True)
-    return normalised
+def plate(rng: np.random.Generator, count: int) -> Points:
+    """Opposite faces within reach of each other: many pairs of parallel normals."""
+    return box(rng, count, (1.2, 0.9, 0.1))
 
 
-def shell(count: int, seed: int) -> np.ndarray:
-    """Points on an ellipsoid that fits the unit sphere."""
-    return ball(count, seed) * [0.9, 0.6, 0.5]
+SHAPES: dict[str, Callable[[np.random.Generator, int], Points]] = {
+    "sphere": sphere,
+    "torus": torus,
+    "box": box,
+    "plate": plate,
+}
 
 
-def torus(count: int, seed: int, large: float = 1.0, small: float = 0.4) -> np.ndarray:
-    """Points on a torus about z, denser on its inside."""
-    around, across = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, count))
-    radius = large + small * np.cos(across)
-    return np.stack([radius * np.cos(around), radius * np.sin(around), small * np.sin(across)], 1)
+def make_cloud(shape: str, count: int = 768, noise: float = 0.0) -> Points:
+    rng = np.random.default_rng(0)
+    return SHAPES[shape](rng, count) + noise * rng.standard_normal((count, 3))
 
 
-def bumpy(count: int, seed: int) -> np.ndarray:
-    """Points on a closed surface without symmetry."""
-    points = ball(count, seed)
-    waves = np.sin(5 * points @ np.array([0.6, 0.0, 0.8])) + np.cos(4 * points @ np.array([0.0, 1.0, 0.3]))
-    bumps: np.ndarray = points * [1.0, 0.6, 0.4] * (0.8 + 0.15 * waves[:, None]) + 0.2 * np.maximum(points, 0)
-    return bumps
+def blob(count: int) -> Points:
+    """A bumpy surface without symmetry."""
+    points = sphere(np.random.default_rng(0), count)
+    return points * (1 + 0.3 * np.sin(points @ [[5.0], [3.0], [1.0]]) + 0.2 * np.cos(points @ [[-1.0], [4.0], [6.0]]))
 
 
-def potato(count: int, seed: int) -> np.ndarray:
-    """Points all over a lumpy closed surface."""
-    direction = ball(count, seed)
-    x, y, z = direction.T
-    radius = 0.7 + 0.15 * np.sin(3 * x + 1) * y + 0.1 * np.cos(4 * z) * x + 0.15 * z**2
-    return np.asarray(radius[:, None] * direction * [1.0, 0.7, 0.5])
+MOTION = rigid.transform(rigid.rotation_exp(np.array([1.1, -2.0, 0.7])), [0.3, -0.2, 0.5])
 
 
-def noise(count: int, seed: int) -> np.ndarray:
-    """Points that lie on no surface."""
-    return np.random.default_rng(seed).normal(size=(count, 3))
+def moved(points: Points) -> Points:
+    return rigid.apply(MOTION, points)
 
 
-def spacing_by_definition(points: np.ndarray) -> float:
-    """The median distance of a point to its nearest neighbour."""
-    distance = distances(points, points)
-    np.fill_diagonal(distance, np.inf)
-    return float(np.median(distance.min(1)))
-
-
-def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The distance (N, M) of each of the points a (N, 3) to each of the points b (M, 3)."""
-    return np.linalg.norm(a[:, None] - b, axis=-1)
+def degenerate_clouds() -> dict[str, Points]:
+    uniform = np.random.default_rng(0).random((300, 3))
+    return {
+        "one place": np.ones((300, 3)),
+        "line": uniform[:, :1] * (0.3, 0.5, 0.8),
+        "axis-parallel line": uniform * (1.0, 0, 0),
+        "plane": uniform * (1.0, 1.0, 0),
+        "lattice": np.stack(np.meshgrid(*3 * [np.arange(6) / 10]), -1).reshape(-1, 3),
+        "duplicates": np.tile(uniform[:20], (15, 1)),
+        "two places": np.tile(uniform[:2], (100, 1)),
+        "nearly duplicates": np.concatenate([uniform[:100] * 1e-21, uniform[:100]]),
+        "nothing within reach": 100 * uniform,
+        "far away": uniform + 1e4,
+        "two points": uniform[:2],
+        "three points": uniform[:3],
+    }

@@ -24,7 +24,7 @@ from idam.search.confidence import CLOSE, CONVERGED, confidence
 from idam.search.matching import FOR
 from motions import any_rotation, degrees, move
 from motions import rigid as motion
-from shapes import ball, box, bracket, distances, noise, torus
+from solids import ball, box, bracket, distances, noise, torus
 
 UTM = np.array([5e5, 5.6e6, 100.0])
 SETTLED = 0.2

@@ -8,7 +8,7 @@ import pytest
 from idam.align import align, reaches, refine
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from motions import degrees, move, rigid
-from shapes import potato
+from solids import potato
 
 NUDGE = rigid([0.08, -0.06, 0.05], [0.03, -0.04, 0.05])
 

@@ -10,7 +10,7 @@ import pytest
 from idam.clouds.frame import MIN_POINTS, STRAY, check_points, core, without_strays
 from idam.errors import InputError
 from motions import any_rotation
-from shapes import noise
+from solids import noise
 
 ORIGIN = np.zeros(3)
 UTM = np.array([5e5, 5.6e6, 100.0])

@@ -7,7 +7,7 @@ import pytest
 
 from idam.clouds.prepared import ALL, BASE, FINE, LARGER, SMALL, Level, Prepared
 from idam.clouds.voxels import downsample, ladder, rung
-from shapes import noise, shell, spacing_by_definition
+from solids import noise, shell, spacing_by_definition
 
 UTM = np.array([5e5, 5.6e6, 100.0])
 

@@ -11,7 +11,7 @@ from idam.clouds.prepared import FINE, LARGER, SMALL, Prepared
 from idam.clouds.pyramid import FINEST, MOST_POINTS, PairLevel, Pyramid
 from idam.errors import InputError
 from motions import any_rotation, move
-from shapes import noise, shell, spacing_by_definition
+from solids import noise, shell, spacing_by_definition
 
 ORIGIN = np.zeros(3)
 UTM = np.array([5e5, 5.6e6, 100.0])

@@ -7,7 +7,7 @@ import pytest
 
 from idam.clouds.surfaces import SAME_SURFACE, TOUCHING, Surface, Surfaces, nearest_within, spacing_of
 from motions import move, rigid
-from shapes import ball, bumpy, distances, shell, spacing_by_definition
+from solids import ball, bumpy, distances, shell, spacing_by_definition
 
 POSE = rigid([0.5, -1.2, 0.7], [0.3, -2.0, 1.0])
 DISTANCE = 0.1

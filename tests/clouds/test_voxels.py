@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from idam.clouds.voxels import ENOUGH, STEPS, downsample, ladder, occupied, rung, rung_for
-from shapes import ball
+from solids import ball
 
 
 @pytest.fixture

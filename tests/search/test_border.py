@@ -8,7 +8,7 @@ import pytest
 from idam.clouds.surfaces import Surface, Surfaces
 from idam.search.sparse.border import ALONE, SHARP, SHRINK, mixing
 from motions import move, rigid
-from shapes import distances
+from solids import distances
 
 SPACING = 0.05
 STAY = np.eye(4)

@@ -9,7 +9,7 @@ from idam.search.consensus import COMPANIONS, ROUNDS, agreeing_transforms, weigh
 from idam.search.matching import FeatureMatches
 from matchings import TOLERANCE, example, swapped
 from motions import any_rotation, move, rigid
-from shapes import distances
+from solids import distances
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.1, 0.2, -0.3])
 OTHER = rigid([-0.5, 0.9, 2.0], [-0.2, 0.0, 0.4])

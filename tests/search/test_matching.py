@@ -15,7 +15,7 @@ from idam.search.matching import AGAINST, FEW, FOR, MATCHES, REACH, FeatureMatch
 from idam.weights import load_descriptor
 from matchings import NO_MATCHES, TOLERANCE, example, level, log_sum, matching_by, scores_for, swapped, thinned
 from motions import move, rigid
-from shapes import bumpy, distances
+from solids import bumpy, distances
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.1, 0.2, -0.3])
 OTHER = rigid([-0.5, 0.9, 2.0], [-0.2, 0.0, 0.4])

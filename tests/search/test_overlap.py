@@ -8,7 +8,7 @@ import pytest
 from idam.clouds.surfaces import SAME_SURFACE, TOUCHING, Surface, Surfaces
 from idam.search.overlap import overlap
 from motions import move, rigid
-from shapes import distances, shell
+from solids import distances, shell
 
 POSE = rigid([0.5, -1.2, 0.7], [0.3, -2.0, 1.0])
 SPACING = 0.06

@@ -11,7 +11,7 @@ from idam.search.ranking import UNLIKELY, Answer, distinct, improve, likeliest, 
 from matchings import level, matching_by, scores_for
 from motions import degrees as angle_between
 from motions import rigid as by_vector
-from shapes import boxes
+from solids import boxes
 
 CORNERS = [([0, 0, 0], [1, 0.6, 0.2]), ([0, 0, 0.2], [0.2, 0.6, 0.8]), ([0.6, 0.1, 0.2], [0.9, 0.3, 0.5])]
 """Three unlike boxes."""

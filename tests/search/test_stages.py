@@ -26,7 +26,7 @@ from idam.search.stages import (
 from idam.weights import load_descriptor
 from matchings import level, matching_by, scores_for
 from motions import degrees, move, rigid
-from shapes import box, bracket, torus
+from solids import box, bracket, torus
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.02, -0.01, 0.03])
 FAR = rigid([0.4, 0.2, -0.1], [9.0, 0.0, 0.0])

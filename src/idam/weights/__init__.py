@@ -17,6 +17,7 @@ from idam.errors import InputError
 
 __all__ = [
     "DEFAULT",
+    "SMALLEST",
     "UNREADABLE",
     "find",
     "list_models",

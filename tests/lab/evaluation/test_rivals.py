@@ -31,7 +31,8 @@ from idam.lab.evaluation.methods.pointnetlk import PointNetLK, pseudo_inverse
 from idam.lab.evaluation.methods.prnet import Config, PRNet, keypoints, straight_through
 from idam.network.features.gnn import neighbour_graph
 from idam.network.geometry import apply_transform, compose, invert, rotation_angle, weighted_procrustes
-from idam.network.pretrained import provenance, save_weights
+from idam.network.pretrained import save_weights
+from idam.weights import provenance
 
 SIZES = {"neighbours": 8, "widths": (16, 32), "heads": 2, "feed_forward": 32}
 SMALL: dict[str, Callable[[], Rival]] = {
@@ -347,7 +348,7 @@ def test_settings_are_the_network_s(tmp_path):
 def trainer() -> ModuleType:
     """benchmarks/train_rival.py."""
     pytest.importorskip("tensorboard", reason="training needs TensorBoard")
-    path = Path(__file__).parents[2] / "benchmarks" / "train_rival.py"
+    path = Path(__file__).parents[3] / "benchmarks" / "train_rival.py"
     spec = importlib.util.spec_from_file_location("train_rival", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules["train_rival"] = module  # its dataclasses look themselves up
