@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from idam import rigid
-from idam.clouds.prepared import Describes
 from idam.clouds.pyramid import PairLevel
+from idam.describe.invariant import Descriptor
 from idam.errors import InputError, MissingDependencyError
 from idam.rigid import Array
 from idam.weights import DEFAULT, find, is_descriptor, load_descriptor
@@ -31,7 +31,7 @@ class Models:
     """
 
     name: str
-    descriptor: Describes
+    descriptor: Descriptor
     idam: Any = None
     exchanged: bool = False
 
@@ -58,10 +58,10 @@ def resolve(model: str | os.PathLike[str], device: str | None = None) -> Models:
         MissingDependencyError: a network is named, and PyTorch is not installed.
     """
     first, plus, second = _text(model).partition("+")
-    if not plus and is_descriptor(find(first)):
+    if not plus and is_descriptor(first):
         return Models(find(first).stem, load_descriptor(first))
     descriptor, network = (first, second) if plus else (DEFAULT, first)
-    if is_descriptor(find(network)) or not is_descriptor(find(descriptor)):
+    if is_descriptor(network) or not is_descriptor(descriptor):
         raise InputError(f"model {_text(model)!r}: give DESCRIPTOR+NETWORK, such as general+gnn-unseen-shapes")
     try:
         from idam.network.pretrained import cached_model

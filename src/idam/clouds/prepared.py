@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +11,10 @@ from numpy.typing import NDArray
 from idam.clouds.frame import core, without_strays
 from idam.clouds.surfaces import Surface, spacing_of
 from idam.clouds.voxels import downsample, ladder, rung, rung_for
+from idam.describe.invariant import Descriptor, surroundings
 from idam.rigid import Array
 
-__all__ = ["ALL", "FINE", "LARGER", "SMALL", "Describes", "Level", "Prepared"]
+__all__ = ["ALL", "FINE", "LARGER", "SMALL", "Level", "Prepared"]
 
 SMALL = 1024
 """Points of the larger cloud that are matched first: what the descriptor was trained on."""
@@ -27,19 +26,6 @@ BASE = 100_000
 """Points that are kept of a cloud, besides those given: all levels are thinned from them."""
 ALL = 0.0
 """The voxel size that stands for no voxel grid at all."""
-
-
-class Describes(Protocol):
-    """A descriptor: features of a cloud's points, by the points and their spacing."""
-
-    @property
-    def key(self) -> Hashable:
-        """Tells one descriptor from another."""
-        ...
-
-    def __call__(self, points: Array, spacing: float) -> NDArray[np.float32]:
-        """Features (N, K) of points (N, 3)."""
-        ...
 
 
 @dataclass(eq=False)
@@ -54,7 +40,7 @@ class Level:
 
     points: Array
     voxel_size: float
-    features: dict[tuple[Hashable, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    features: dict[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
     _surfaces: dict[float, Surface] = field(default_factory=dict, repr=False)
     _spacing: list[float] = field(default_factory=list, repr=False)
 
@@ -76,11 +62,11 @@ class Level:
             self._surfaces[unit] = Surface.of(self.points / unit)
         return self._surfaces[unit]
 
-    def described(self, descriptor: Describes, spacing: int) -> NDArray[np.float32]:
+    def described(self, descriptor: Descriptor, spacing: int) -> NDArray[np.float32]:
         """Features (N, K) of the points, at a spacing of that rung."""
         key = descriptor.key, spacing
         if key not in self.features:
-            self.features[key] = descriptor(self.points, ladder(spacing))
+            self.features[key] = descriptor.describe(surroundings(self.points, ladder(spacing)))
         return self.features[key]
 
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from idam import rigid
 from idam.clouds.frame import MIN_POINTS
-from idam.clouds.prepared import ALL, FINE, LARGER, SMALL, Describes, Level, Prepared
+from idam.clouds.prepared import ALL, FINE, LARGER, SMALL, Level, Prepared
 from idam.clouds.surfaces import Surfaces
+from idam.describe.invariant import Descriptor
 from idam.errors import InputError
 from idam.rigid import Array
 
@@ -64,7 +65,7 @@ class PairLevel:
         """Points of the larger cloud."""
         return max(len(self.source_level.points), len(self.target_level.points))
 
-    def features(self, descriptor: Describes) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def features(self, descriptor: Descriptor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """What a descriptor makes of the source's and the target's points, (N, K) and (P, K), at one spacing."""
         spacing = max(level.spacing_rung for level in (self.source_level, self.target_level))
         return self.source_level.described(descriptor, spacing), self.target_level.described(descriptor, spacing)

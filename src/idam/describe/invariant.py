@@ -15,6 +15,7 @@ Here is the forward pass, in NumPy. :class:`idam.network.features.invariant.Inva
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -104,6 +105,9 @@ class Descriptor:
     Args:
         weights: of :class:`idam.network.features.invariant.Invariant`, by the names that torch gives them.
 
+    Attributes:
+        key: tells one descriptor's weights from another's.
+
     Raises:
         KeyError: a weight is missing.
     """
@@ -114,6 +118,10 @@ class Descriptor:
         self._first, self._norm, self._last = (_Affine(arrays, name) for name in ("first", "norm", "last"))
         self._layers = [_Layer(arrays, name) for name in layers]
         self._length = arrays["length"]
+        digest = hashlib.blake2b(digest_size=16)
+        for name in sorted(arrays):
+            digest.update(name.encode() + arrays[name].tobytes())
+        self.key = digest.hexdigest()
 
     def describe(self, around: Surroundings) -> Array:
         """Features (N, 32) float32 of a cloud's points by their surroundings."""

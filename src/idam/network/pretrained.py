@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +19,12 @@ from idam.errors import InputError
 from idam.io.files import write_bytes
 from idam.network.config import Config
 from idam.network.model import IDAM
-from idam.weights import UNREADABLE, find, list_models, not_a_model, provenance, read_weights, without_denormals
+from idam.weights import UNREADABLE, find, not_a_model, read_weights, without_denormals
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["find", "list_models", "load_model", "provenance", "restore", "save_model", "save_weights"]
+__all__ = ["cached_model", "load_model", "restore", "save_model", "save_weights"]
 
 
 def load_model(name: str | os.PathLike[str] = "default", device: str | torch.device | None = None) -> IDAM:
@@ -52,6 +53,18 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0][:120]
         raise InputError(f"device {str(device)!r} cannot be used ({reason}); leave it out for the CPU") from None
+
+
+def cached_model(name: str | os.PathLike[str], device: str | None = None) -> IDAM:
+    """:func:`load_model`, read again only where the file has changed."""
+    path = find(name).resolve()
+    status = path.stat()
+    return _cached(path, status.st_mtime_ns, status.st_size, device)
+
+
+@lru_cache(4)
+def _cached(path: Path, modified: int, size: int, device: str | None) -> IDAM:
+    return load_model(path, device)
 
 
 def restore(network: nn.Module, weights: Mapping[str, NDArray[Any]]) -> None:

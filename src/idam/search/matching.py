@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from idam import rigid
-from idam.clouds.prepared import Describes
 from idam.clouds.pyramid import PairLevel
+from idam.describe.invariant import Descriptor
 from idam.describe.products import product
 from idam.rigid import Array, Rows
 
@@ -66,7 +66,7 @@ class Matching:
     matches: FeatureMatches
 
     @classmethod
-    def of(cls, descriptor: Describes, clouds: PairLevel) -> Matching:
+    def of(cls, descriptor: Descriptor, clouds: PairLevel) -> Matching:
         """By the features of a descriptor: their inner products, over the root of their length."""
         source, target = clouds.features(descriptor)
         score = product(source, target.T) / np.float32(source.shape[1] ** 0.5)

@@ -10,9 +10,9 @@ import numpy as np
 
 from idam import rigid
 from idam.align import align, reaches
-from idam.clouds.prepared import Describes
 from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
+from idam.describe.invariant import Descriptor
 from idam.rigid import Array
 from idam.search.confidence import CLOSE, Evidence, confidence
 from idam.search.consensus import agreeing_transforms
@@ -96,7 +96,7 @@ class Found:
         return Found([best, *left], self.matching)
 
 
-def search(clouds: Pyramid, descriptor: Describes, network: Network | None, scope: Scope, method: str) -> Found:
+def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, scope: Scope, method: str) -> Found:
     """The answers that explain both clouds best.
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,

@@ -20,6 +20,7 @@ __all__ = [
     "SMALLEST",
     "UNREADABLE",
     "find",
+    "is_descriptor",
     "list_models",
     "load_descriptor",
     "not_a_model",
@@ -89,6 +90,11 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         metadata = file.metadata() or {}
         weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
     return _config(metadata), weights
+
+
+def is_descriptor(name: str | os.PathLike[str]) -> bool:
+    """Whether a model's features are those that no pose changes; raise InputError where it is not a model."""
+    return bool(provenance(name)["config"].get("features") == "invariant")
 
 
 def load_descriptor(name: str | os.PathLike[str] = "default") -> Descriptor:
