@@ -152,6 +152,8 @@ def prepared(data: Any, name: str) -> Prepared:
     """Anything that :func:`register` takes, checked and ready; raise InputError where it cannot be used."""
     if isinstance(data, Prepared):
         return data
+    if isinstance(data, (str, os.PathLike)) and os.fspath(data).endswith(".idam"):
+        return Prepared.load(data)
     if isinstance(data, (str, os.PathLike)):
         points, name = as_point_cloud(data).points, os.fspath(data)
     else:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from idam import rigid
+from idam.align import align, reaches
 from idam.align.information import information
 from idam.clouds.pyramid import Pyramid
 from idam.clouds.surfaces import TOUCHING
@@ -83,18 +84,19 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
     scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
-    found = found.refined(clouds.fine.surfaces, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
+    best = align(surfaces, found.best, reaches(method)[1], method)
+    poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
     return Solution(
-        answers=[Hypothesis(clouds.leave(answer.transformation), answer.score) for answer in found.answers],
+        answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],
         evidence=found.evidence,
         matches=Matches(
             matches.source * unit + clouds.source.centre,
             matches.target * unit + clouds.target.centre,
             found.weights,
         ),
-        information=clouds.information_left(information(surfaces, found.best)),
+        information=clouds.information_left(information(surfaces, best)),
         distance=TOUCHING * surfaces.spacing * unit,
-        source_misses=unit * surfaces.target.nearest(rigid.apply(found.best, surfaces.source.points))[0],
-        target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(found.best), surfaces.target.points))[0],
+        source_misses=unit * surfaces.target.nearest(rigid.apply(best, surfaces.source.points))[0],
+        target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(best), surfaces.target.points))[0],
     )

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
+from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from idam.clouds.frame import core, without_strays
 from idam.clouds.surfaces import Surface, spacing_of
+from idam.clouds.viewpoint import DepthMap
 from idam.clouds.voxels import downsample, ladder, rung, rung_for
 from idam.describe.invariant import Descriptor, surroundings
+from idam.errors import InputError
+from idam.io.files import write_bytes
 from idam.rigid import Array
 
 __all__ = ["ALL", "FINE", "LARGER", "SMALL", "Level", "Prepared"]
@@ -22,6 +31,8 @@ LARGER = 2000
 """Points of the larger cloud that are matched where the small clouds do not settle the matter."""
 FINE = 10_000
 """Points of the larger cloud that the last refinement uses."""
+FORMAT = 1
+"""Of saved clouds: changes when they can no longer be read, or would give other answers."""
 BASE = 100_000
 """Points that are kept of a cloud, besides those given: all levels are thinned from them."""
 ALL = 0.0
@@ -106,6 +117,12 @@ class Prepared:
         """The points that all levels are thinned from, :data:`BASE` at most."""
         return self.level(self.voxel_size(BASE))
 
+    @cached_property
+    def depth(self) -> DepthMap | None:
+        """How far the scan sees from its frame's origin, around the centre in input units; None for no single scan."""
+        points = self._centred()
+        return DepthMap.of(points[:: len(points) // BASE + 1], -self.centre)
+
     def voxel_size(self, count: int) -> float:
         """The voxel size of the ladder that leaves at most ``count`` points, :data:`ALL` where there are no more."""
         if count not in self._rungs:
@@ -129,3 +146,44 @@ class Prepared:
     def _centred(self) -> Array:
         """The points (N, 3) relative to the centre, in input units, without strays."""
         return without_strays(self.points - self.centre, self.radius)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the cloud with all that was worked out so far, atomically; :meth:`load` reads it.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        arrays: dict[str, NDArray[Any]] = {"points": self.points, "centre": self.centre}
+        sizes = sorted(self.levels)
+        for number, size in enumerate(sizes):
+            level = self.levels[size]
+            arrays[f"{number}.points"] = level.points
+            arrays |= {f"{number}.{key}.{step}": features for (key, step), features in level.features.items()}
+        about = {"format": FORMAT, "name": self.name, "radius": self.radius, "sizes": sizes}
+        write_bytes(
+            path, save({key: np.ascontiguousarray(x) for key, x in arrays.items()}, {"idam": json.dumps(about)})
+        )
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Prepared:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            InputError: the file cannot be read, or is something else.
+        """
+        try:
+            with safe_open(path, "np") as file:
+                about = json.loads(file.metadata()["idam"])
+                if about["format"] != FORMAT:
+                    raise ValueError("another version of idam wrote it")
+                arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+            cloud = cls(arrays.pop("points"), about["name"], arrays.pop("centre"), float(about["radius"]))
+            for number, size in enumerate(about["sizes"]):
+                level = cloud.levels[size] = Level(arrays.pop(f"{number}.points"), size)
+                for name in [name for name in arrays if name.startswith(f"{number}.")]:
+                    _, key, step = name.split(".")
+                    level.features[key, int(step)] = arrays[name]
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError, IndexError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+            raise InputError(f"{path}: not a prepared cloud ({reason}); make it anew with idam.prepare") from None
+        return cloud

@@ -12,6 +12,7 @@ from idam import rigid
 from idam.clouds.frame import MIN_POINTS
 from idam.clouds.prepared import ALL, FINE, LARGER, SMALL, Level, Prepared
 from idam.clouds.surfaces import Surfaces
+from idam.clouds.viewpoint import FreeSpace
 from idam.describe.invariant import Descriptor
 from idam.errors import InputError
 from idam.rigid import Array
@@ -22,6 +23,8 @@ MOST_POINTS = 4096
 """Points of either cloud at most that features are matched on, where the caller chooses the voxel size."""
 FINEST = 1e-4
 """Smallest voxel size, in working units: far below the spacing of the fine clouds, and small_gicp's grid has room."""
+MARGIN = 2.0
+"""Spacings of the fine clouds by which a point lies in front of a surface for it to contradict a transform."""
 ODD_SIZES = 50.0
 """Ratio of two clouds' sizes from which on their units are probably not the same."""
 
@@ -34,11 +37,13 @@ class PairLevel:
         source_level: the source.
         target_level: the target.
         unit: input units in one working unit.
+        free_space: what the scans saw through.
     """
 
     source_level: Level
     target_level: Level
     unit: float
+    free_space: FreeSpace
 
     @cached_property
     def surfaces(self) -> Surfaces:
@@ -127,7 +132,16 @@ class Pyramid:
 
     def at(self, voxel_size: float) -> PairLevel:
         """Both clouds on a voxel grid, its size in input units."""
-        return PairLevel(self.source.level(voxel_size), self.target.level(voxel_size), self.unit)
+        return PairLevel(self.source.level(voxel_size), self.target.level(voxel_size), self.unit, self.free_space)
+
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """What the scans saw through, asked of the fine clouds."""
+        voxel_size = max(cloud.voxel_size(FINE) for cloud in (self.source, self.target))
+        levels = [cloud.level(voxel_size) for cloud in (self.source, self.target)]
+        depths = [cloud.depth and cloud.depth.scaled(self.unit) for cloud in (self.source, self.target)]
+        margin = MARGIN * max(level.spacing for level in levels) / self.unit
+        return FreeSpace(levels[0].points / self.unit, levels[1].points / self.unit, depths[0], depths[1], margin)
 
     def leave(self, working: Array) -> Array:
         """A working transform (..., 4, 4) as one from source to target in the input's coordinates."""

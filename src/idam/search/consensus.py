@@ -36,11 +36,12 @@ def agreeing_transforms(matches: FeatureMatches, seeds: int) -> Array:
         return np.empty((0, 4, 4))
     second_order = _second_order_compatibility(source, target, matches.tolerance)
     seed = np.argsort(-second_order.sum(1), kind="stable")[:seeds]
-    companion = np.argsort(-second_order[seed], axis=1, kind="stable")[:, : min(COMPANIONS, len(source))]
+    last = min(COMPANIONS, len(source)) - 1
+    companion = np.argpartition(-second_order[seed], last, axis=1)[:, : last + 1]
     index = np.concatenate([seed[:, None], companion], 1)
     weight = np.take_along_axis(second_order[seed], companion, 1)
     # the seed itself is compatible with whatever its best companion is
-    weight = np.concatenate([weight[:, :1], weight], 1)
+    weight = np.concatenate([weight.max(1, keepdims=True), weight], 1)
     transforms = weighted_procrustes(source[index], target[index], weight.astype(np.float64))
     for _ in range(ROUNDS):
         transforms = weighted_procrustes(source, target, _together(matches, transforms))
@@ -78,7 +79,7 @@ def weighted_procrustes(source: Array, target: Array, weight: Array) -> Array:
 
 def _second_order_compatibility(source: Array, target: Array, tolerance: float) -> NDArray[np.float32]:
     """For each two compatible matches how many others both are compatible with (M, M); 0 for incompatible ones."""
-    first, second = (np.sqrt(((x[:, None] - x) ** 2).sum(-1)) for x in (source, target))
+    first, second = (_distances(points) for points in (source, target))
     compatible = (np.abs(first - second) < tolerance).astype(np.float32)
     np.fill_diagonal(compatible, 0)
     second_order: NDArray[np.float32] = compatible * product(compatible, compatible)
@@ -90,3 +91,12 @@ def _together(matches: FeatureMatches, transforms: Array) -> Array:
     miss = rigid.apply(transforms, matches.source) - matches.target
     near: Array = (np.einsum("smd,smd->sm", miss, miss) < matches.tolerance**2).astype(np.float64)
     return near
+
+
+def _distances(points: Array) -> Array:
+    """Distances (M, M) of points (M, 3) from each other, coordinate by coordinate: an (M, M, 3) array takes longer."""
+    square = np.zeros((len(points), len(points)))
+    for x in points.T:
+        gap = x[:, None] - x
+        square += gap * gap
+    return np.sqrt(square)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.align import align
+from idam.align import align, reaches
+from idam.clouds.surfaces import TOUCHING, Surfaces
 from idam.rigid import Array
 from idam.search.matching import Matching
-from idam.search.overlap import overlap
+from idam.search.overlap import exactness, shares
 from idam.search.sparse.border import mixing
 
-__all__ = ["Answer", "distinct", "improve", "likeliest", "ranked", "scored"]
+__all__ = ["Answer", "distinct", "improve", "likeliest", "ranked", "same", "scored", "verified"]
 
 SAME_ANGLE = 10.0
 """Degrees within which two answers count as one."""
@@ -23,8 +24,13 @@ SAME_SHIFT = 0.1
 """Distance within which two answers must lay the source's centre to count as one, in working units."""
 ITERATIONS = 12
 """Of the refinement before an answer is scored: right ones have come near by then, wrong ones may never."""
+STEPS = 6
+"""Of the refinement on the fine clouds, where an answer comes from the coarser ones; the last one has more."""
 UNLIKELY = 0.05
 """Overlap counts for so much where the features do not speak for an answer: on flat ground they say nothing."""
+VIOLATION, MOST_VIOLATION = 0.002, 0.02
+"""Share of points where the other scan saw through that halves a score; and the most that counts, since scans of
+moving objects and bleeding edges have some in the right pose."""
 MIXED = 2.0
 """How fast the score of sparse clouds' answers falls with :func:`idam.search.sparse.border.mixing`. The features of
 dense clouds say enough, and what a scanner sees of them does not end at a plane."""
@@ -36,24 +42,37 @@ class Answer:
 
     Attributes:
         transformation: (4, 4), working source to working target.
-        overlap: agreement of the clouds under it, in [0, 1].
+        overlap: geometric mean of the shares of both clouds that lie on the other, in [0, 1].
+        contained: the larger of both shares, in [0, 1]: 1 for a part in a whole.
         support: share of the feature matches that it brings together, in [0, 1].
         likelihood: how much likelier the features make it than chance
             (:meth:`idam.search.matching.Matching.likelihood`).
         border: 1 where what only one cloud shows lies past where the other ends, less where it lies amid the other
             (:func:`idam.search.sparse.border.mixing`), of sparse clouds.
+        violation: share of the points that lie where the other scan saw through, in [0, 1].
+        close: share of what touches that touches on the fine clouds, too, in [0, 1]
+            (:func:`idam.search.overlap.exactness`); of answers that were refined on them.
+        off: median distance from the tangent planes there, as a share of the reach.
     """
 
     transformation: Array
     overlap: float = 0.0
+    contained: float = 0.0
     support: float = 0.0
     likelihood: float = 0.0
     border: float = 1.0
+    violation: float = 0.0
+    close: float = 0.0
+    off: float = 1.0
 
     @property
     def score(self) -> float:
-        """What answers are ranked by: surfaces slid into wrong contact overlap, too, but their points are not alike."""
-        return (max(self.likelihood, 0.0) + UNLIKELY * self.overlap) * self.border
+        """What answers are ranked by before they are refined on the fine clouds.
+
+        Surfaces slid into wrong contact overlap, too, but their points are not alike.
+        """
+        explained = max(self.likelihood, 0.0) + UNLIKELY * self.overlap
+        return explained * self.border / (1 + min(self.violation, MOST_VIOLATION) / VIOLATION)
 
 
 def improve(transformations: Iterable[Array], matching: Matching, reach: float, method: str) -> list[Answer]:
@@ -66,10 +85,25 @@ def improve(transformations: Iterable[Array], matching: Matching, reach: float, 
 def scored(transformation: Array, matching: Matching, *, sparse: bool) -> Answer:
     """A transform (4, 4) with all that speaks for it on the matched clouds."""
     surfaces = matching.clouds.surfaces
-    border = math.exp(-MIXED * mixing(surfaces, transformation)) if sparse else 1.0
-    support = matching.matches.support(transformation)
-    shared = overlap(surfaces, transformation)
-    return Answer(transformation, shared, support, matching.likelihood(transformation), border)
+    mine, theirs = shares(surfaces, transformation)
+    return Answer(
+        transformation,
+        overlap=(mine * theirs) ** 0.5,
+        contained=max(mine, theirs),
+        support=matching.matches.support(transformation),
+        likelihood=matching.likelihood(transformation),
+        border=math.exp(-MIXED * mixing(surfaces, transformation)) if sparse else 1.0,
+        violation=matching.clouds.free_space.violation(transformation),
+    )
+
+
+def verified(answer: Answer, matching: Matching, fine: Surfaces, method: str) -> Answer:
+    """An answer refined on the fine clouds, and how exactly they lie on each other."""
+    surfaces = matching.clouds.surfaces
+    transformation = align(fine, answer.transformation, reaches(method)[1], method, STEPS)
+    close, off = exactness(fine, transformation, TOUCHING * surfaces.spacing)
+    violation = matching.clouds.free_space.violation(transformation)
+    return replace(answer, transformation=transformation, violation=violation, close=close, off=off)
 
 
 def likeliest(transformations: Array, matching: Matching, most: int) -> Array:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from idam import rigid
-from idam.align import align, reaches
+from idam.align import reaches
 from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
@@ -17,8 +17,9 @@ from idam.rigid import Array
 from idam.search.confidence import CLOSE, Evidence, confidence
 from idam.search.consensus import agreeing_transforms
 from idam.search.matching import Matching
-from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, same
+from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, verified
 from idam.search.scope import Scope
+from idam.search.slides import slides
 
 __all__ = ["Found", "Network", "search"]
 
@@ -33,14 +34,18 @@ HYPOTHESES = 64
 """Different transforms, among those that the sets agree on, whose likelihood is asked for."""
 EXAMINED = 8
 """The likeliest of them, which are refined."""
+SLID = 6
+"""The likeliest of the poses that the best answer may be mistaken for, which are refined, too."""
 CONTENDERS = 6
 """Answers that are kept, and that stay in the race against what larger clouds say."""
 TAUGHT = 90.0
 """Degrees that the pairs which a network of the paper's kind is taught are turned at most."""
 NEAR = 20.0
 """Degrees from such a network's answer within which transforms are looked into."""
-APART, APART_SHIFT = 30.0, 0.3
-"""Degrees and working units past which refinement does not carry one answer to another."""
+VERIFIED = 4
+"""Answers at most that are refined on the fine clouds before one is chosen."""
+CONTENDS = 0.3
+"""Share of the best score from which on an answer is refined on the fine clouds, too."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -75,26 +80,6 @@ class Found:
         weight = self.matching.matches.weights(self.best)
         return weight / (weight.sum() or 1.0)
 
-    def refined(self, fine: Surfaces, method: str) -> Found:
-        """With the best answer refined on finer clouds, and without others that end where it does.
-
-        Two answers that started apart may be one that had not come to rest.
-        """
-        if method == "none":
-            return self
-        first, *others = self.answers
-        reach = reaches(method)[1]
-        best = replace(first, transformation=align(fine, first.transformation, reach, method))
-        left = [
-            other
-            for other in others
-            if not (
-                near(other.transformation, best.transformation)
-                and same(best.transformation, align(fine, other.transformation, reach, method))
-            )
-        ]
-        return Found([best, *left], self.matching)
-
 
 def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, scope: Scope, method: str) -> Found:
     """The answers that explain both clouds best.
@@ -114,7 +99,7 @@ def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, sco
     for level, seeds in to_match(clouds):
         matching = Matching.of(descriptor, level)
         agreed = scope.within(agreeing_transforms(matching.matches, seeds))
-        found = explain(np.concatenate([candidates, agreed]), matching, scope, method)
+        found = explain(np.concatenate([candidates, agreed]), matching, scope, method, clouds.fine.surfaces)
         sure = confidence(found.evidence)
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
@@ -122,10 +107,14 @@ def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, sco
         if sure >= SURE:
             return found
         candidates = np.array([answer.transformation for answer in found.answers])
-    return found if network is None else choose(network, found, agreed, matching, scope, method)
+    if network is None:
+        return found
+    return choose(network, found, agreed, matching, scope, method, clouds.fine.surfaces)
 
 
-def choose(network: Network, found: Found, agreed: Array, matching: Matching, scope: Scope, method: str) -> Found:
+def choose(
+    network: Network, found: Found, agreed: Array, matching: Matching, scope: Scope, method: str, fine: Surfaces
+) -> Found:
     """Of poses that look alike, the one that a network of the paper's kind may have learnt is meant.
 
     It is asked from the guess. Where nothing turns by more than it was taught, what is found near its answer comes
@@ -137,9 +126,10 @@ def choose(network: Network, found: Found, agreed: Array, matching: Matching, sc
         return found
     if scope.max_angle > TAUGHT:
         tried = improve(asked, matching, reaches(method)[0], method)
-        return Found(least_turned(ranked([*found.answers, *tried]), scope.guess), matching)
+        answers = judged(ranked([*found.answers, *tried]), matching, method, fine)
+        return Found(least_turned(answers, scope.guess), matching)
     nearby = scope.around(asked[0], NEAR)
-    near = explain(np.concatenate([asked, nearby.within(agreed)]), matching, nearby, method)
+    near = explain(np.concatenate([asked, nearby.within(agreed)]), matching, nearby, method, fine)
     surer = confidence(near.evidence)
     log.info("near the network's answer, all else ruled out: confidence %.2f", surer)
     if surer < confidence(found.evidence):
@@ -148,12 +138,27 @@ def choose(network: Network, found: Found, agreed: Array, matching: Matching, sc
     return Found(first_of_its_kind([best, *ranked([*others, *found.answers])]), matching)
 
 
-def explain(candidates: Array, matching: Matching, scope: Scope, method: str) -> Found:
+def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fine: Surfaces) -> Found:
     """What the likeliest of the candidates (S, 4, 4) come to: refined, scored and looked at closely."""
     tried = likeliest(candidates[distinct(candidates, HYPOTHESES)], matching, EXAMINED)
-    answers = ranked(improve(tried, matching, reaches(method)[0], method))[:CONTENDERS]
+    answers = ranked(improve(tried, matching, reaches(method)[0], method))
+    mistaken = scope.within(slides(matching.clouds.surfaces, answers[0].transformation))
+    if len(mistaken):
+        slid = likeliest(mistaken, matching, SLID)
+        answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
-    return Found(least_turned(answers, scope.guess), matching)
+    return Found(least_turned(judged(answers[:CONTENDERS], matching, method, fine), scope.guess), matching)
+
+
+def judged(answers: list[Answer], matching: Matching, method: str, fine: Surfaces) -> list[Answer]:
+    """The answers, the best first, those that may be right refined on the fine clouds.
+
+    Two that started apart may be one that had not come to rest.
+    """
+    contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
+    contenders = [verified(answer, matching, fine, method) for answer in contenders]
+    rest = answers[len(contenders) :]
+    return first_of_its_kind([*sorted(contenders, key=lambda answer: -answer.score), *rest])
 
 
 def to_match(clouds: Pyramid) -> Iterator[tuple[PairLevel, int]]:
@@ -176,10 +181,3 @@ def least_turned(answers: list[Answer], guess: Array) -> list[Answer]:
     tied = [answer for answer in answers if answer.score >= (1 - CLOSE) * answers[0].score]
     first = min(tied, key=lambda answer: float(rigid.angle(guess[:3, :3].T @ answer.transformation[:3, :3])))
     return [first, *(answer for answer in answers if answer is not first)]
-
-
-def near(one: Array, other: Array) -> bool:
-    """Whether two working transforms (4, 4) may be one that has not come to rest."""
-    turned = rigid.angle(one[:3, :3].T @ other[:3, :3])
-    shift = np.linalg.norm(one[:3, 3] - other[:3, 3])
-    return bool(turned < np.radians(APART) and shift < APART_SHIFT)

@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from idam import rigid
 from idam.describe.invariant import Surroundings, surroundings
 from idam.errors import InputError
-from idam.lab.data.general import Material, ScanPair, draw_halves, draw_scans, load_meshes
+from idam.lab.data.general import Material, draw_halves, draw_scans, load_meshes
 from idam.lab.data.modelnet40 import load
+from idam.lab.data.working import ScanPair
 from idam.lab.training.batches import VALIDATION_SEED, generator_at
 from idam.lab.training.checkpoint import initial_model
 from idam.lab.training.recipe import Recipe
