@@ -1,12 +1,9 @@
-"""What all tests share: one thread a process, and the fixtures of networks where torch is installed."""
+"""What all tests share: one thread a process. Fixtures that need torch are in ``networks.py``."""
 
 import os
-from importlib.util import find_spec
 
 # Unless the caller says otherwise, and in the processes that tests start as well: a second thread gains nothing on
 # inputs this small, and costs many times as long where other work has the cores (OpenMP's threads spin). NumPy and
-# torch read this when they are first imported, hence the plugin below rather than imports here.
+# torch read this when they are first imported.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
-
-pytest_plugins = ["networks"] if find_spec("torch") else []

@@ -13,6 +13,7 @@ import numpy as np
 
 from idam import rigid
 from idam.clouds.surfaces import Surfaces
+from idam.describe.products import gram
 from idam.rigid import Array
 
 __all__ = ["symmetric_icp"]
@@ -67,4 +68,5 @@ def _step(surfaces: Surfaces, transformation: Array, reach: float) -> Array:
     weight = (1 - (distance / reach) ** 2) * (1 + (residual[0] / (OFF * reach)) ** 2) ** -2.0 * cosine**2
     gradient = np.concatenate([np.cross(p, directions), directions], -1).reshape(-1, 6)
     weighted = gradient * (np.array([1.0, PULL, PULL, PULL])[:, None] * weight).reshape(-1, 1)
-    return np.linalg.solve(gradient.T @ weighted + DAMPING * np.eye(6), -(weighted.T @ residual.ravel()))
+    system = gram(weighted, np.concatenate([gradient, residual.reshape(-1, 1)], 1))
+    return np.linalg.solve(system[:, :6] + DAMPING * np.eye(6), -system[:, 6])

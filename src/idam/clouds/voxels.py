@@ -36,8 +36,11 @@ def downsample(points: Array, voxel_size: float) -> Array:
     """
     import small_gicp
 
+    # the library counts the fourth coordinate, 1, in voxels, too: below a millionth there is no room for it
+    unit = 2.0 ** math.floor(math.log2(voxel_size))
     # one thread: with several, the library's result depends on their timing
-    return np.ascontiguousarray(small_gicp.voxelgrid_sampling(points, voxel_size, num_threads=1).points()[:, :3])
+    means = small_gicp.voxelgrid_sampling(points / unit, voxel_size / unit, num_threads=1).points()[:, :3]
+    return np.ascontiguousarray(means * unit)
 
 
 def occupied(points: Array, voxel_size: float) -> int:

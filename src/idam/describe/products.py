@@ -6,7 +6,7 @@ import numpy as np
 
 from idam.describe.neighbours import Array
 
-__all__ = ["product"]
+__all__ = ["gram", "product"]
 
 SMALL = 2**18
 """Multiplications up to which OpenBLAS takes one thread (its 65536 times GEMM_MULTITHREAD_THRESHOLD)."""
@@ -26,6 +26,15 @@ def product(x: Array, y: Array, out: Array | None = None) -> Array:
     for some in (slice(n, n + columns) for n in range(0, y.shape[1], columns)):
         _in_blocks_of_rows(x, y[:, some], out[:, some])
     return out
+
+
+def gram(x: Array, y: Array) -> Array:
+    """The product x^T y (K, P) of x (N, K) and y (N, P) with N far larger than K and P, likewise: a sum of blocks."""
+    rows = max(1, SMALL // (x.shape[1] * y.shape[1]))
+    total = np.zeros((x.shape[1], y.shape[1]), x.dtype)
+    for some in (slice(n, n + rows) for n in range(0, len(x), rows)):
+        total += x[some].T @ y[some]
+    return total
 
 
 def _in_blocks_of_rows(x: Array, y: Array, out: Array) -> None:

@@ -62,9 +62,10 @@ def weighted_procrustes(source: Array, target: Array, weight: Array) -> Array:
     total = weight.sum(-1, keepdims=True)
     weight = np.where(total > 0, weight / np.where(total > 0, total, 1.0), 1.0 / weight.shape[-1])
     if source.ndim == 2:  # one cloud for all: moments are one product
-        source_mean, target_mean = weight @ source, weight @ target
         products = (source[:, :, None] * target[:, None, :]).reshape(len(source), 9)
-        covariance = (weight @ products).reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
+        moments = product(weight, np.concatenate([source, target, products], 1))
+        source_mean, target_mean = moments[:, :3], moments[:, 3:6]
+        covariance = moments[:, 6:].reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
     else:
         source_mean, target_mean = (np.einsum("sn,snd->sd", weight, points) for points in (source, target))
         centred = weight[:, :, None] * (source - source_mean[:, None])
