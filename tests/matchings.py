@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
-import torch
-from scipy.spatial.distance import cdist
-from torch import Tensor
 
-from idam.clouds.pyramid import Level
+from idam.clouds.prepared import ALL, Level
+from idam.clouds.pyramid import PairLevel
+from idam.clouds.voxels import downsample, ladder, rung_for
 from idam.search.matching import FeatureMatches, Matching
-from idam.search.ranking import Answer
 from motions import move
+from solids import distances
 
 TOLERANCE = 0.02
-NO_MATCHES = FeatureMatches(torch.empty(0, 3), torch.empty(0, 3), TOLERANCE)
-
-
-def as_matches(source: np.ndarray, target: np.ndarray, tolerance: float = TOLERANCE) -> FeatureMatches:
-    first, second = (torch.as_tensor(points, dtype=torch.float32) for points in (source, target))
-    return FeatureMatches(first, second, tolerance)
+NO_MATCHES = FeatureMatches(np.empty((0, 3)), np.empty((0, 3)), TOLERANCE)
 
 
 def example(*right: tuple[np.ndarray, int], wrong: int, seed: int = 0) -> FeatureMatches:
@@ -33,41 +25,38 @@ def example(*right: tuple[np.ndarray, int], wrong: int, seed: int = 0) -> Featur
         target[first : first + count] = move(transformation, source[first : first + count])
         first += count
     rows = random.permutation(len(source))
-    return as_matches(source[rows], target[rows])
+    return FeatureMatches(source[rows], target[rows], TOLERANCE)
 
 
 def swapped(matches: FeatureMatches) -> FeatureMatches:
     return FeatureMatches(matches.target, matches.source, matches.tolerance)
 
 
-def matching_by(clouds: Level, score: Tensor, matches: FeatureMatches = NO_MATCHES) -> Matching:
+def level(source: np.ndarray, target: np.ndarray) -> PairLevel:
+    """Two clouds as they are."""
+    return PairLevel(Level(source, ALL), Level(target, ALL), 1.0)
+
+
+def thinned(points: np.ndarray, count: int) -> np.ndarray:
+    """At most so many points, evenly spread."""
+    step = rung_for(points, count, 1.0)
+    assert step is not None
+    return downsample(points, ladder(step))
+
+
+def matching_by(clouds: PairLevel, score: np.ndarray, matches: FeatureMatches = NO_MATCHES) -> Matching:
     """What scores (N, P) say of clouds."""
-    return Matching(clouds, score, score.logsumexp(1), score.logsumexp(0), matches)
+    score = score.astype(np.float32)
+    return Matching(clouds, score, log_sum(score, 1), log_sum(score, 0), matches)
 
 
-def scores_for(clouds: Level, transformation: np.ndarray) -> Tensor:
-    """The nearer a transform (4, 4) lays two points to each other, the more alike they are."""
-    distance = cdist(move(transformation, clouds.source), clouds.target)
-    return torch.as_tensor(-distance / clouds.spacing, dtype=torch.float32)
+def log_sum(score: np.ndarray, axis: int) -> np.ndarray:
+    """The logarithm of the sum of exponentials, of scores of any size."""
+    highest = score.max(axis, keepdims=True)
+    total = np.log(np.exp((score - highest).astype(np.float64)).sum(axis)) + highest.squeeze(axis)
+    return np.asarray(total.astype(np.float32))
 
 
-def bumpy(count: int, seed: int) -> np.ndarray:
-    """Points on a closed surface without symmetry."""
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    waves = np.sin(5 * points @ np.array([0.6, 0.0, 0.8])) + np.cos(4 * points @ np.array([0.0, 1.0, 0.3]))
-    bumps: np.ndarray = points * [1.0, 0.6, 0.4] * (0.8 + 0.15 * waves[:, None]) + 0.2 * np.maximum(points, 0)
-    return bumps
-
-
-def vase(count: int, seed: int) -> np.ndarray:
-    """Points on a surface of revolution about z."""
-    rng = np.random.default_rng(seed)
-    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.8, 0.8, count)
-    radius = 0.4 + 0.15 * np.cos(4 * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
-
-
-def anything(transformations: Iterable[np.ndarray]) -> list[Answer]:
-    """Transforms (4, 4) as answers, however far they turn."""
-    return [Answer(x) for x in transformations]
+def scores_for(clouds: PairLevel, transformation: np.ndarray) -> np.ndarray:
+    """The nearer a transform (4, 4) moves two points to each other, the more alike they are."""
+    return -distances(move(transformation, clouds.source), clouds.target) / clouds.spacing

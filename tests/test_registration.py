@@ -3,73 +3,33 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import subprocess
+import sys
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
-import trimesh
-from scipy.spatial.distance import cdist
-from scipy.spatial.transform import Rotation
 
 import idam
-from idam import RegistrationResult, registration
-from idam import search as searching
-from idam.align import METHODS, Surfaces
-from idam.clouds.frame import common_frame
+from idam import RegistrationResult, rigid
+from idam.align import METHODS
+from idam.clouds.prepared import Prepared
 from idam.errors import InputError
-from idam.io import PointCloud, write_point_cloud
-from idam.network.pretrained import find
-from idam.registration import as_rigid, in_input_units, smaller_first
-from idam.result import Matches
-from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence, doubt
+from idam.io import PointCloud, read_point_cloud, write_point_cloud
+from idam.registration import as_rigid
+from idam.search.confidence import CLOSE, CONVERGED, confidence
 from idam.search.matching import FOR
-from idam.search.ranking import alike
-from motions import move
+from motions import any_rotation, degrees, move
+from motions import rigid as motion
+from solids import ball, box, bracket, distances, noise, torus
 
 UTM = np.array([5e5, 5.6e6, 100.0])
 SETTLED = 0.2
 """Degrees, and hundredths of the cloud's size, within which refinement ends up in the same place."""
-
-
-def rigid(rotation: Rotation, translation: Any) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation.as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def degrees(a: np.ndarray, b: np.ndarray) -> float:
-    """The angle between the rotations of two transforms."""
-    return float(np.degrees(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude()))
-
-
-def bracket(count: int, seed: int) -> np.ndarray:
-    """Points on a part without symmetry, about one unit long."""
-    corners = [
-        ([0, 0, 0], [1, 0.5, 0.12]),
-        ([0, 0, 0.12], [0.15, 0.5, 0.82]),
-        ([0.55, 0.1, 0.12], [0.8, 0.3, 0.47]),
-        ([0.8, 0.35, 0.12], [0.9, 0.45, 0.27]),
-    ]
-    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in corners])
-    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
-
-
-def ball(count: int, seed: int) -> np.ndarray:
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-def noise(count: int, seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(count, 3))
-
-
-TRUTH = rigid(Rotation.from_rotvec([1.0, -1.5, 0.8]), [1.0, 2.0, 3.0])
+TRUTH = motion([1.0, -1.5, 0.8], [1.0, 2.0, 3.0])
 SOURCE = bracket(400, seed=1)
 TARGET = move(TRUTH, bracket(450, seed=2))
 CENTRE = SOURCE.mean(0)
@@ -83,6 +43,15 @@ def assert_right(result: RegistrationResult, truth: np.ndarray, centre: np.ndarr
 def assert_settled(transformation: np.ndarray, expected: np.ndarray, centre: np.ndarray, size: float = 1.0) -> None:
     assert degrees(transformation, expected) < SETTLED
     assert np.linalg.norm(move(transformation, centre) - move(expected, centre)) < SETTLED / 100 * size
+
+
+def assert_same_bits(one: RegistrationResult, other: RegistrationResult) -> None:
+    for name in ("transformation", "information", "correspondence_set"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.matches.weight, other.matches.weight)
+    alike = ("fitness", "inlier_rmse", "confidence", "reason", "evidence", "max_correspondence_distance")
+    assert [getattr(one, name) for name in alike] == [getattr(other, name) for name in alike]
+    assert [each.score for each in one.hypotheses] == [each.score for each in other.hypotheses]
 
 
 def refusal(*data: Any, **options: Any) -> str:
@@ -106,6 +75,8 @@ def result() -> RegistrationResult:
 
 def test_easy_pair(result: RegistrationResult) -> None:
     assert_right(result, TRUTH, CENTRE)
+    assert result.converged
+    assert result.reason == ""
 
 
 def test_transformation_is_rigid_in_double_precision(result: RegistrationResult) -> None:
@@ -122,11 +93,11 @@ def test_figures_are_those_of_brute_force(result: RegistrationResult) -> None:
     assert pairs.ndim == 2
     assert pairs.shape[1] == 2
     assert pairs.dtype.kind == "i"
-    distance = cdist(result.apply(SOURCE), TARGET)
-    rows = np.flatnonzero(distance.min(1) < result.max_correspondence_distance)
+    distance = distances(result.apply(SOURCE), TARGET)
+    rows = np.flatnonzero(distance.min(1) <= result.max_correspondence_distance)
     assert 0 < len(rows) < len(SOURCE)
     np.testing.assert_array_equal(pairs, np.stack([rows, distance.argmin(1)[rows]], 1))
-    assert result.fitness == len(rows) / len(SOURCE)
+    assert result.fitness == pytest.approx(len(rows) / len(SOURCE))
     assert result.inlier_rmse == pytest.approx(np.sqrt(np.mean(distance.min(1)[rows] ** 2)))
 
 
@@ -135,7 +106,7 @@ def test_other_fields(result: RegistrationResult) -> None:
     evidence = result.evidence
     assert all(0.0 < share <= 1.0 for share in (evidence.overlap, evidence.support, evidence.margin))
     assert 0.5 < evidence.likelihood <= FOR
-    assert result.model == "default"
+    assert result.model == "general"
     assert 0.0 < result.seconds < 60.0
     assert result.information.shape == (6, 6)
     assert np.linalg.eigvalsh(result.information).min() > 0
@@ -146,8 +117,8 @@ def test_matches_are_in_the_input_coordinates(result: RegistrationResult) -> Non
     assert matches.source.shape == matches.target.shape == (*matches.weight.shape, 3)
     assert matches.weight.sum() == pytest.approx(1.0)
     # 400 points are matched as they are
-    assert cdist(matches.source, SOURCE).min(1).max() < 1e-5
-    assert cdist(matches.target, TARGET).min(1).max() < 1e-5
+    assert distances(matches.source, SOURCE).min(1).max() < 1e-12
+    assert distances(matches.target, TARGET).min(1).max() < 1e-12
 
 
 def test_matches_weigh_the_more_the_closer_the_answer_brings_them(result: RegistrationResult) -> None:
@@ -155,14 +126,12 @@ def test_matches_weigh_the_more_the_closer_the_answer_brings_them(result: Regist
     miss = np.linalg.norm(result.apply(matches.source) - matches.target, axis=1)
     kept = matches.weight > 0
     assert 0 < kept.sum() < len(kept)
-    # the last refinement still moves them a little
-    assert miss[kept].max() < miss[~kept].min() + 0.02
+    assert miss[kept].max() < miss[~kept].min()
     assert np.corrcoef(miss[kept], matches.weight[kept])[0, 1] < -0.9
 
 
 def test_runners_up_are_other_transforms_that_score_less() -> None:
-    box = trimesh.creation.box((1.2, 0.8, 0.5))
-    source, target = (np.asarray(trimesh.sample.sample_surface(box, 700, seed=seed)[0]) for seed in (1, 2))
+    source, target = (box((1.2, 0.8, 0.5), 700, seed) for seed in (1, 2))
     result = idam.register(source, move(TRUTH, target))
     assert len(result.hypotheses) >= 3  # the half turns of a box
     scores = [other.score for other in result.hypotheses]
@@ -170,16 +139,14 @@ def test_runners_up_are_other_transforms_that_score_less() -> None:
     for other in result.hypotheses:
         rotation = other.transformation[:3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert not alike(other.transformation, result.transformation)
+        assert degrees(other.transformation, result.transformation) > 8
         # they, too, bring the source to the target
         assert np.linalg.norm(move(other.transformation, source.mean(0)) - move(TRUTH, target.mean(0))) < 0.3
 
 
 def test_an_answer_turns_no_further_than_it_may() -> None:
-    box = trimesh.creation.box((1.2, 0.8, 0.5))
-    source, target = (np.asarray(trimesh.sample.sample_surface(box, 700, seed=seed)[0]) for seed in (1, 2))
-    turn = rigid(Rotation.from_rotvec([0.2, 1.0, -0.3]), [0.1, 0.0, 0.2])
-    half = rigid(Rotation.from_rotvec([0.0, np.pi, 0.0]), [0.0, 0.0, 0.0])
+    source, target = (box((1.2, 0.8, 0.5), 700, seed) for seed in (1, 2))
+    turn, half = motion([0.2, 1.0, -0.3], [0.1, 0.0, 0.2]), motion([0.0, np.pi, 0.0], [0.0, 0.0, 0.0])
     for init, expected in ((None, turn), (turn @ half, turn @ half)):
         result = idam.register(source, move(turn, target), init=init, max_angle=80)
         assert degrees(result.transformation, expected) < 2
@@ -189,20 +156,6 @@ def test_an_answer_turns_no_further_than_it_may() -> None:
     assert degrees(idam.register(TARGET, SOURCE, max_angle=120).transformation, np.linalg.inv(TRUTH)) < 2
 
 
-@pytest.mark.parametrize(
-    "evidence", [Evidence(0.9, 0.8, 3.0, 0.9), Evidence(0.1, 0.01, 0.1, 0.01), Evidence(0.0, 0.0, 0.0, 0.0)]
-)
-def test_reason_is_given_where_the_answer_is_not_to_count_on(
-    evidence: Evidence, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    search = registration.search
-    monkeypatch.setattr(registration, "search", lambda *args: replace(search(*args), evidence=evidence))
-    result = idam.register(SOURCE, move(TRUTH, SOURCE))
-    assert result.confidence == confidence(evidence)
-    assert result.converged is (result.confidence >= CONVERGED)
-    assert result.reason == ("" if result.converged else doubt(evidence))
-
-
 def test_max_correspondence_distance_is_what_is_measured_at() -> None:
     near, far = (idam.register(SOURCE, TARGET, max_correspondence_distance=np.float32(d)) for d in (0.01, 0.5))
     assert near.max_correspondence_distance == pytest.approx(0.01)
@@ -210,54 +163,8 @@ def test_max_correspondence_distance_is_what_is_measured_at() -> None:
     assert near.fitness < far.fitness == 1.0
     np.testing.assert_array_equal(near.transformation, far.transformation)
     assert all(isinstance(figure, float) for figure in (far.max_correspondence_distance, far.fitness, far.inlier_rmse))
-
-
-def test_same_seed_same_bits(result: RegistrationResult) -> None:
-    torch.rand(3)
-    state = torch.get_rng_state()
-    again = idam.register(SOURCE, TARGET)
-    np.testing.assert_array_equal(again.transformation, result.transformation)
-    np.testing.assert_array_equal(again.information, result.information)
-    assert again.confidence == result.confidence
-    assert (torch.get_rng_state() == state).all()
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    """Sets the number of threads, for the test."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize(
-    ("source", "target", "model"),
-    [(SOURCE, move(TRUTH, SOURCE[40:]), "default"), (SOURCE[:150], noise(120, seed=1), "gnn-unseen-shapes")],
-    ids=["easy", "hard"],
-)
-def test_any_number_of_threads_same_bits(
-    source: np.ndarray,
-    target: np.ndarray,
-    model: str,
-    threads: Callable[[int], None],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(searching, "STARTS", 4)
-    found = []
-    for count in (1, 2):
-        threads(count)
-        found.append(idam.register(source, target, model=model))
-    one, two = found
-    np.testing.assert_array_equal(one.transformation, two.transformation)
-    np.testing.assert_array_equal(one.matches.weight, two.matches.weight)
-    assert one.confidence == two.confidence
-    assert [other.score for other in one.hypotheses] == [other.score for other in two.hypotheses]
-
-
-@pytest.mark.parametrize("seed", [7, -1, np.int64(7)])
-def test_any_seed_finds_the_easy_pair(result: RegistrationResult, seed: Any) -> None:
-    other = idam.register(SOURCE, TARGET, seed=seed)
-    assert_settled(other.transformation, result.transformation, CENTRE)
+    distance = distances(near.apply(SOURCE), TARGET).min(1)
+    assert near.fitness == (distance <= near.max_correspondence_distance).mean()
 
 
 def test_clouds_are_left_as_they_were() -> None:
@@ -267,11 +174,85 @@ def test_clouds_are_left_as_they_were() -> None:
     np.testing.assert_array_equal(target, TARGET)
 
 
+# --- same bits -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 7, -1, np.int64(7)])
+def test_any_seed_same_bits(result: RegistrationResult, seed: Any) -> None:
+    assert_same_bits(idam.register(SOURCE, TARGET, seed=seed), result)
+
+
+IN_PROCESS = """
+import sys
+import numpy as np
+import idam
+for source, target in zip(*[iter(sys.argv[1:])] * 2):
+    result = idam.register(np.load(source), np.load(target))
+    print(result.transformation.tobytes().hex(), result.matches.weight.tobytes().hex(), repr(result.evidence))
+    print(result.information.tobytes().hex(), [each.score.hex() for each in result.hypotheses], result.fitness.hex())
+"""
+
+
+def test_any_number_of_threads_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clouds = {
+        "easy": (SOURCE, move(TRUTH, SOURCE[40:])),
+        "hard": (SOURCE[:150], noise(120, seed=1)),
+        "many": (bracket(3000, seed=3), move(TRUTH, torus(3000, seed=4))),  # which goes on to the larger clouds
+    }
+    names: list[str] = []
+    for name, pair in clouds.items():
+        for role, points in zip(("source", "target"), pair, strict=True):
+            names.append(str(tmp_path / f"{name}-{role}.npy"))
+            np.save(names[-1], points)
+    printed = []
+    for threads in ("1", "2"):
+        for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            monkeypatch.setenv(variable, threads)
+        done = subprocess.run(
+            [sys.executable, "-c", IN_PROCESS, *names], capture_output=True, text=True, timeout=120, check=True
+        )
+        printed.append(done.stdout)
+    assert printed[0].count("\n") == 2 * len(clouds)
+    assert printed[0] == printed[1]
+
+
+def test_prepared_clouds_same_bits(result: RegistrationResult, tmp_path: Path) -> None:
+    source, target = idam.prepare(SOURCE), idam.prepare(TARGET)
+    assert isinstance(source, Prepared)
+    assert_same_bits(idam.register(source, target), result)
+    assert_same_bits(idam.register(source, target), result)  # again, with all of it worked out
+    assert_same_bits(idam.register(source, TARGET), result)
+
+
+def test_prepared_clouds_same_bits_whatever_they_were_registered_with_before() -> None:
+    source, target = bracket(3000, seed=1), move(TRUTH, bracket(2500, seed=2))
+    expected = idam.register(source, target)
+    prepared = idam.prepare(source)
+    for other in (0.5 * bracket(1500, seed=5), torus(4000, seed=6), target):
+        idam.register(prepared, other)
+    assert_same_bits(idam.register(prepared, idam.prepare(target)), expected)
+
+
+def test_prepare_leaves_little_to_do() -> None:
+    source, target = (idam.prepare(bracket(3000, seed=seed)) for seed in (1, 2))
+    levels = [{size: id(level) for size, level in cloud.levels.items()} for cloud in (source, target)]
+    features = [sum(len(level.features) for level in cloud.levels.values()) for cloud in (source, target)]
+    assert features == [1, 1]
+    idam.register(source, target)
+    # nothing that had been made was made anew
+    for cloud, before in zip((source, target), levels, strict=True):
+        assert before.items() <= {size: id(level) for size, level in cloud.levels.items()}.items()
+
+
 # --- what it takes -------------------------------------------------------------------------------------------------
 
 
+def as_torch(points: np.ndarray) -> Any:
+    return pytest.importorskip("torch").tensor(points, requires_grad=True)
+
+
 def as_trimesh(points: np.ndarray) -> Any:
-    return trimesh.PointCloud(points)
+    return pytest.importorskip("trimesh").PointCloud(points)
 
 
 def as_open3d(points: np.ndarray) -> Any:
@@ -282,24 +263,20 @@ def as_open3d(points: np.ndarray) -> Any:
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
 
 
-@pytest.mark.parametrize(
-    "kind", [torch.tensor, np.ndarray.tolist, PointCloud, np.asfortranarray, as_trimesh, as_open3d]
-)
+@pytest.mark.parametrize("kind", [np.ndarray.tolist, PointCloud, np.asfortranarray, as_torch, as_trimesh, as_open3d])
 def test_takes(kind: Callable[[np.ndarray], Any], result: RegistrationResult) -> None:
-    found = idam.register(kind(SOURCE), kind(TARGET))
-    assert_settled(found.transformation, result.transformation, CENTRE)
-    np.testing.assert_array_equal(found.correspondence_set, result.correspondence_set)
+    assert_same_bits(idam.register(kind(SOURCE), kind(TARGET)), result)
 
 
 def test_takes_paths_of_single_precision(result: RegistrationResult, tmp_path: Path) -> None:
     write_point_cloud(tmp_path / "source.ply", SOURCE)
-    found = idam.register(tmp_path / "source.ply", torch.tensor(TARGET, dtype=torch.float32, requires_grad=True))
+    found = idam.register(tmp_path / "source.ply", TARGET.astype(np.float32))
     assert_settled(found.transformation, result.transformation, CENTRE)
     found = idam.register(str(tmp_path / "source.ply"), TARGET)
     assert_settled(found.transformation, result.transformation, CENTRE)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 0.3048, 1000.0])
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 0.3048, 1000.0, 1e9])
 def test_unit_does_not_matter(result: RegistrationResult, unit: float) -> None:
     found = idam.register(unit * SOURCE, unit * TARGET)
     in_our_unit = found.transformation.copy()
@@ -309,6 +286,16 @@ def test_unit_does_not_matter(result: RegistrationResult, unit: float) -> None:
     assert found.fitness == pytest.approx(result.fitness, abs=0.01)
     assert found.inlier_rmse == pytest.approx(unit * result.inlier_rmse, rel=0.02)
     assert found.confidence == pytest.approx(result.confidence, abs=0.05)
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 0.25, 1024.0])
+def test_a_unit_of_a_power_of_two_changes_no_digit(result: RegistrationResult, unit: float) -> None:
+    found = idam.register(unit * SOURCE, unit * TARGET)
+    np.testing.assert_array_equal(found.transformation[:3, :3], result.transformation[:3, :3])
+    np.testing.assert_allclose(found.transformation[:3, 3], unit * result.transformation[:3, 3], rtol=1e-14)
+    scale = np.array([1, 1, 1, unit, unit, unit])
+    np.testing.assert_allclose(found.information * np.outer(scale, scale), result.information, rtol=1e-9, atol=1e-6)
+    assert found.evidence == result.evidence
 
 
 @pytest.mark.parametrize(("source_at", "target_at"), [(UTM, UTM), (UTM, 0 * UTM), (-UTM, UTM[::-1])])
@@ -323,9 +310,10 @@ def test_place_does_not_matter(result: RegistrationResult, source_at: np.ndarray
     )
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_turning_the_clouds_turns_the_answer(result: RegistrationResult, seed: int) -> None:
-    turns = [rigid(rotation, 0.0) for rotation in Rotation.random(2, rng=np.random.default_rng(seed))]
+    random = np.random.default_rng(seed)
+    turns = [rigid.transform(any_rotation(random), np.zeros(3)) for _ in range(2)]
     source, target = move(turns[0], SOURCE), move(turns[1], TARGET)
     found = turns[1].T @ idam.register(source, target).transformation @ turns[0]
     # the search starts elsewhere, but what the clouds say is the same
@@ -340,45 +328,76 @@ def test_order_of_points_does_not_matter(result: RegistrationResult) -> None:
     np.testing.assert_array_equal(np.sort(rows[found.correspondence_set[:, 0]]), result.correspondence_set[:, 0])
 
 
-@pytest.mark.parametrize("unlike", [SOURCE, TARGET, move(TRUTH, bracket(300, seed=4)[:200])])
-def test_which_cloud_counts_as_the_smaller_depends_on_the_clouds_alone(unlike: np.ndarray) -> None:
-    other = 1.1 * bracket(450, seed=3)
-    turn = rigid(Rotation.from_rotvec([0.3, 2.0, -1.0]), [1.0, 0.0, -2.0])
-    assert smaller_first(unlike, other) is not smaller_first(other, unlike)
-    assert smaller_first(move(turn, unlike), other) is smaller_first(unlike, other)
+# --- the other way round -------------------------------------------------------------------------------------------
+
+PAIRS = {
+    "easy": (SOURCE, TARGET),
+    "sizes alike": (SOURCE, move(TRUTH, bracket(400, seed=2))),
+    "itself, moved": (SOURCE, move(TRUTH, SOURCE)),
+    "dense": (bracket(3000, seed=1), move(TRUTH, bracket(2500, seed=2)) + UTM),
+    "nothing in common": (SOURCE, noise(500, 1)),
+}
 
 
-def test_swapping_the_clouds_inverts_the_answer(result: RegistrationResult) -> None:
-    back = idam.register(TARGET, SOURCE)
-    inverse = np.linalg.inv(back.transformation)
-    # found in the same direction, but the last refinement takes the other
-    assert degrees(inverse, result.transformation) < 2.0
-    assert np.linalg.norm(move(inverse, CENTRE) - result.apply(CENTRE)) < 0.02
-    assert back.confidence == result.confidence
-    assert back.evidence == result.evidence
-    assert back.reason == result.reason
-    np.testing.assert_array_equal(back.matches.source, result.matches.target)
-    np.testing.assert_array_equal(back.matches.target, result.matches.source)
-    np.testing.assert_array_equal(back.matches.weight, result.matches.weight)
-    for one, other in zip(back.hypotheses, result.hypotheses, strict=True):
-        np.testing.assert_allclose(np.linalg.inv(one.transformation), other.transformation, atol=1e-9)
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("options", [{}, {"refine": "point", "max_angle": 130.0}, {"refine": None}], ids=str)
+def test_swapping_the_clouds_inverts_the_answer(name: str, options: dict[str, Any]) -> None:
+    source, target = PAIRS[name]
+    forth, back = idam.register(source, target, **options), idam.register(target, source, **options)
+    rotation = forth.transformation[:3, :3]
+    np.testing.assert_allclose(back.transformation[:3, :3], rotation.T, rtol=0, atol=1e-9)
+    scale = 1 + np.abs(target).max()
+    np.testing.assert_allclose(forth.apply(back.apply(target)), target, rtol=0, atol=1e-9 * scale)
+    assert back.confidence == forth.confidence
+    assert back.evidence == forth.evidence
+    assert back.reason == forth.reason
+    np.testing.assert_array_equal(back.matches.source, forth.matches.target)
+    np.testing.assert_array_equal(back.matches.target, forth.matches.source)
+    np.testing.assert_array_equal(back.matches.weight, forth.matches.weight)
+    for one, other in zip(back.hypotheses, forth.hypotheses, strict=True):
+        np.testing.assert_allclose(rigid.inverse(one.transformation), other.transformation, rtol=0, atol=1e-9 * scale)
         assert one.score == other.score
+    assert back.max_correspondence_distance == forth.max_correspondence_distance
 
 
-def test_swapping_the_clouds_and_the_init_inverts_what_is_not_refined() -> None:
-    init = rigid(Rotation.from_rotvec([0.5, 0.0, 0.0]), [1.0, 2.0, 3.0])
-    forth = idam.register(SOURCE, TARGET, refine=None, init=init)
-    back = idam.register(TARGET, SOURCE, refine=None, init=np.linalg.inv(init))
-    np.testing.assert_allclose(np.linalg.inv(back.transformation), forth.transformation, atol=1e-9)
-    assert back.confidence == pytest.approx(forth.confidence, abs=1e-9)
+def test_a_cloud_on_itself_stays() -> None:
+    found = idam.register(SOURCE, SOURCE)
+    np.testing.assert_allclose(found.transformation, np.eye(4), atol=1e-9)
+    assert found.fitness == 1.0
+    assert found.inlier_rmse < 1e-9
 
 
-def test_a_cloud_on_itself_is_its_own_inverse() -> None:
-    moved = move(TRUTH, SOURCE)
-    forth, back = idam.register(SOURCE, moved), idam.register(moved, SOURCE)
-    for found, truth in ((forth, TRUTH), (back, np.linalg.inv(TRUTH))):
-        np.testing.assert_allclose(found.transformation, truth, atol=1e-4)
-    assert forth.confidence == pytest.approx(back.confidence, abs=1e-4)
+def test_swapping_the_clouds_and_the_init_inverts_the_answer() -> None:
+    init = motion([0.5, 0.0, 0.0], [1.0, 2.0, 3.0])
+    for options in ({"refine": None}, {"max_angle": 20.0}, {}):
+        forth = idam.register(SOURCE, TARGET, init=init, **options)
+        back = idam.register(TARGET, SOURCE, init=np.linalg.inv(init), **options)
+        np.testing.assert_allclose(rigid.inverse(back.transformation), forth.transformation, atol=1e-9)
+        assert back.confidence == pytest.approx(forth.confidence, abs=1e-9)
+
+
+def test_swapped_information_is_that_of_the_inverse() -> None:
+    forth, back = idam.register(SOURCE, TARGET), idam.register(TARGET, SOURCE)
+    # (T exp(x))^-1 = T^-1 exp(-Ad x): the same change costs the same either way
+    for x in np.random.default_rng(0).normal(0, 1e-3, (10, 6)):
+        changed = forth.transformation @ rigid.exp(x)
+        y = rigid.log(rigid.inverse(back.transformation) @ rigid.inverse(changed))
+        assert y @ back.information @ y == pytest.approx(x @ forth.information @ x, rel=1e-6)
+
+
+def test_moving_the_target_leaves_the_information_and_moving_the_source_carries_it() -> None:
+    source, target = bracket(3000, seed=1), move(TRUTH, bracket(2500, seed=2))
+    plain = idam.register(source, target, refine="point")
+    shift = motion([0.0, 0.0, 0.0], [30.0, -20.0, 10.0])
+    moved = idam.register(source, move(shift, target), refine="point")
+    np.testing.assert_allclose(moved.information, plain.information, rtol=1e-3, atol=1e-3 * plain.information.max())
+    elsewhere = idam.register(move(shift, source), target, refine="point")
+    expected = rigid.carried(plain.information, rigid.adjoint(shift))
+    np.testing.assert_allclose(elsewhere.information, expected, rtol=1e-3, atol=1e-3 * expected.max())
+
+
+def test_covariance_is_the_inverse_of_the_information(result: RegistrationResult) -> None:
+    np.testing.assert_allclose(result.covariance @ result.information, np.eye(6), atol=1e-6)
 
 
 # --- how sure it is ------------------------------------------------------------------------------------------------
@@ -398,13 +417,10 @@ def test_sure_of_a_clean_pair_with_much_overlap() -> None:
     ("source", "target"),
     [
         (ball(500, 1), ball(500, 2)),
-        (
-            bracket(400, seed=1),
-            np.asarray(trimesh.sample.sample_surface(trimesh.creation.torus(1, 0.4), 500, seed=3)[0]),
-        ),
-        (bracket(400, seed=1), noise(500, 1)),
-        (bracket(400, seed=1), 0.5 * ball(500, 2)),
-        (bracket(400, seed=1), ball(500, 1)),
+        (SOURCE, torus(500, 3)),
+        (SOURCE, noise(500, 1)),
+        (SOURCE, 0.5 * ball(500, 2)),
+        (SOURCE, ball(500, 1)),
     ],
     ids=["two spheres", "a torus", "noise", "a small sphere", "a sphere"],
 )
@@ -427,8 +443,9 @@ def test_points_given_more_than_once(result: RegistrationResult, copies: int) ->
 
 
 @pytest.mark.parametrize(("count", "distance"), [(400, 1e3), (400, 1e9), (3000, 1e7)])
-def test_a_stray_point_does_no_harm(count: int, distance: float, capfd: pytest.CaptureFixture[str]) -> None:
-    source = np.vstack([bracket(count, seed=1), [[distance, 0, 0]]])
+@pytest.mark.parametrize("strays", [1, 10])
+def test_stray_points_do_no_harm(count: int, distance: float, strays: int, capfd: pytest.CaptureFixture[str]) -> None:
+    source = np.vstack([bracket(count, seed=1), distance * ball(strays, seed=3)])
     found = idam.register(source, move(TRUTH, bracket(count, seed=2)))
     assert_right(found, TRUTH, CENTRE)
     assert np.isfinite(found.inlier_rmse)
@@ -444,62 +461,46 @@ def test_smallest_clouds() -> None:
 def test_plane_on_plane() -> None:
     plane = SOURCE * [1, 1, 0]
     found = idam.register(plane, move(TRUTH, plane))
-    # which way it lies in the plane may be anybody's guess, but on the plane it lies
+    # where in the plane it lies may be anybody's guess, but in the plane it lies
     assert np.abs(move(np.linalg.inv(TRUTH), found.apply(plane))[:, 2]).max() < 0.05
 
 
-def test_source_too_small_beside_the_target() -> None:
-    message = refusal(0.01 * SOURCE, bracket(3000, seed=3))
-    assert message.startswith("source")
-    assert refusal(bracket(3000, seed=3), 0.01 * SOURCE).startswith("target")
+def test_clouds_in_millimetres_and_in_metres_are_told_so() -> None:
+    millimetres, metres = 1000 * bracket(3000, seed=1), bracket(3000, seed=3)
+    assert re.match(r"source: \d+ times the size of target; if their units differ, scale", refusal(millimetres, metres))
+    assert re.match(r"target: \d+ times the size of source; if their units differ, scale", refusal(metres, millimetres))
+    # so few points are matched as they are, and do not fit
+    assert not idam.register(1000 * SOURCE, metres).converged
 
 
 def test_few_places_many_points() -> None:
-    assert refusal(np.repeat(SOURCE[:5], 30, axis=0), TARGET).startswith("source")
+    message = refusal(np.repeat(SOURCE[:5], 30, axis=0), TARGET)
+    assert message.startswith("source: 5 points are left")
 
 
 # --- options -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("refine", METHODS)
-def test_refinements(refine: str) -> None:
+def test_refinements(refine: Any) -> None:
     found = idam.register(SOURCE, TARGET, refine=refine)
     assert_right(found, TRUTH, CENTRE)
     assert found.information.any()
 
 
-@pytest.mark.parametrize(("refine", "method"), [("gicp", "symmetric"), ("plane", "plane")])
-def test_last_refinement_takes_the_fine_clouds(refine: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = []
-
-    def noted(surfaces: Surfaces, start: np.ndarray, *rest: Any) -> tuple[np.ndarray, np.ndarray]:
-        taken.append((len(surfaces.source.points), len(surfaces.target.points), rest[-1]))
-        return start, np.zeros((6, 6))
-
-    monkeypatch.setattr("idam.registration.align", noted)
-    idam.register(SOURCE, TARGET, refine=refine)
-    assert taken == [(len(SOURCE), len(TARGET), method)]
+def test_gicp_is_symmetric_on_few_points_and_not_on_many() -> None:
+    few, many = (SOURCE, TARGET), (bracket(1500, seed=1), move(TRUTH, bracket(1500, seed=2)))
+    for clouds, alike in ((few, True), (many, False)):
+        found, symmetric = (idam.register(*clouds, refine=refine).transformation for refine in ("gicp", "symmetric"))
+        assert (found == symmetric).all() == alike
 
 
 def test_no_refinement(result: RegistrationResult) -> None:
     with_none, with_word = (idam.register(SOURCE, TARGET, refine=refine) for refine in (None, "none"))
-    np.testing.assert_array_equal(with_none.transformation, with_word.transformation)
-    np.testing.assert_array_equal(with_none.information, np.zeros((6, 6)))
+    assert_same_bits(with_none, with_word)
     assert degrees(result.transformation, TRUTH) < degrees(with_none.transformation, TRUTH) < 10.0
     rotation = with_none.transformation[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-
-
-def test_model_by_name_and_by_file(tmp_path: Path) -> None:
-    name = "gnn-unseen-shapes"
-    copy = tmp_path / "mine.safetensors"
-    copy.write_bytes(find(name).read_bytes())
-    by_name = idam.register(SOURCE, TARGET, model=name)
-    assert by_name.model == name
-    for model in (copy, str(copy)):
-        by_file = idam.register(SOURCE, TARGET, model=model)
-        np.testing.assert_array_equal(by_file.transformation, by_name.transformation)
-        assert by_file.model == "mine"
 
 
 def test_init_is_tried_as_it_is() -> None:
@@ -517,19 +518,19 @@ def test_init_is_taken_as_the_rotation_nearest_to_it() -> None:
 
 @pytest.mark.parametrize("rotation", [[0.0, 0.0, 0.0], [1.0, -1.5, 0.8]])
 def test_as_rigid_keeps_what_is_rigid(rotation: list[float]) -> None:
-    matrix = rigid(Rotation.from_rotvec(rotation), [1, 2, 3])
+    matrix = motion(rotation, [1, 2, 3])
     np.testing.assert_allclose(as_rigid(matrix.tolist()), matrix, atol=1e-12)
 
 
 def test_init_may_be_far_off(result: RegistrationResult) -> None:
-    far = rigid(Rotation.from_rotvec([3.0, 0.0, 0.0]), [50.0, 0.0, -9.0])
-    for init in (far, far.tolist(), torch.tensor(far)):
+    far = motion([3.0, 0.0, 0.0], [50.0, 0.0, -9.0])
+    for init in (far, far.tolist()):
         found = idam.register(SOURCE, TARGET, init=init)
         assert_settled(found.transformation, result.transformation, CENTRE)
 
 
 def test_init_of_clouds_far_from_the_origin() -> None:
-    there, back = rigid(Rotation.identity(), UTM), rigid(Rotation.identity(), -UTM)
+    there, back = motion([0, 0, 0], UTM), motion([0, 0, 0], -UTM)
     found = idam.register(SOURCE + UTM, TARGET + UTM, refine=None, init=there @ TRUTH @ back)
     np.testing.assert_allclose(found.apply(SOURCE + UTM), move(TRUTH, SOURCE) + UTM, rtol=0, atol=1e-6)
 
@@ -538,7 +539,8 @@ def test_voxel_size_sets_where_matches_are_sought() -> None:
     source, target = bracket(2000, seed=1), move(TRUTH, bracket(2000, seed=2))
     coarse, fine = (idam.register(1000 * source, 1000 * target, voxel_size=size) for size in (150.0, 60.0))
     assert len(coarse.matches.weight) < len(fine.matches.weight) < 2000
-    assert_right(fine, rigid(Rotation.from_matrix(TRUTH[:3, :3]), 1000 * TRUTH[:3, 3]), 1000 * CENTRE, 1000.0)
+    truth = rigid.transform(TRUTH[:3, :3], 1000 * TRUTH[:3, 3])
+    assert_right(fine, truth, 1000 * CENTRE, 1000.0)
 
 
 def test_voxel_size_below_the_spacing_changes_nothing(
@@ -598,12 +600,11 @@ def test_refuses_a_voxel_size_that_leaves_nothing() -> None:
     message = refusal(1000 * SOURCE, 1000 * TARGET, voxel_size=3000.0)
     assert re.search(r"voxel.size", message)
     assert "smaller" in message
-    figures = [float(figure) for figure in re.findall(r"\d+\.\d+|\d{3,}", message)]
+    figures = [float(figure) for figure in re.findall(r"\d+\.\d+|\d{3,}|\d+e[+-]\d+", message)]
     assert set(figures) <= {3000.0}  # in the caller's unit, if at all
 
 
-def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "search", lambda *_: pytest.fail("all of them were searched"))
+def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds() -> None:
     assert "larger" in refusal(bracket(6000, seed=1), bracket(6000, seed=2), voxel_size=1e-4)
 
 
@@ -613,6 +614,7 @@ def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds(monkeypatch: py
         ("model", "nosuch", "gnn-unseen-shapes"),
         ("model", "", "unknown model"),
         ("model", "nosuch.safetensors", "nosuch.safetensors"),
+        ("model", 7, "model must be a name or a path, not a int"),
         ("max_angle", 0, "max_angle"),
         ("max_angle", -5.0, "max_angle"),
         ("max_angle", 181, "max_angle"),
@@ -620,8 +622,6 @@ def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds(monkeypatch: py
         ("max_angle", "any", "max_angle"),
         ("refine", "magic", "gicp, plane, point, symmetric or none"),
         ("refine", ["gicp"], "gicp, plane, point, symmetric or none"),
-        ("device", "abacus", "abacus"),
-        ("device", "cuda:99", "cuda:99"),
         ("seed", 2**70, "seed"),
         ("seed", 1.5, "seed"),
         ("seed", "one", "seed"),
@@ -646,8 +646,8 @@ def test_refuses_a_file_that_is_no_model(tmp_path: Path) -> None:
         np.diag([1.0, 1, -1, 1]),
         np.full((4, 4), np.nan),
         np.full((4, 4), np.inf),
-        rigid(Rotation.identity(), [np.inf, 0, 0]),
-        rigid(Rotation.identity(), [1, 2, 3]).T,
+        motion([0, 0, 0], [np.inf, 0, 0]),
+        motion([0, 0, 0], [1, 2, 3]).T,
         [[1, 2], [3]],
         "identity",
     ],
@@ -656,32 +656,20 @@ def test_refuses_what_is_not_rigid(init: Any) -> None:
     assert refusal(init=init).startswith("init ")
 
 
-# --- coordinates ---------------------------------------------------------------------------------------------------
-
-
-def test_matches_in_input_units_keep_their_weights() -> None:
-    frame = common_frame(SOURCE + UTM, 2 * TARGET)
-    weight = np.linspace(0, 1, len(SOURCE))
-    working = Matches(frame.source(SOURCE + UTM), frame.target(2 * TARGET[: len(SOURCE)]), weight)
-    matches = in_input_units(working, frame)
-    np.testing.assert_allclose(matches.source, SOURCE + UTM, atol=1e-6)
-    np.testing.assert_allclose(matches.target, 2 * TARGET[: len(SOURCE)], atol=1e-9)
-    assert matches.weight is weight
-
-
 # --- the shipped scans ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "turn", [Rotation.identity(), Rotation.from_rotvec([2.0, -1.0, 1.5])], ids=["as shipped", "turned"]
-)
-def test_shipped_scans(turn: Rotation) -> None:
-    with resources.as_file(resources.files("idam") / "data" / "demo") as folder:
-        source, target = (np.asarray(trimesh.load(folder / name).vertices) for name in ("source.ply", "target.ply"))
-        truth = np.loadtxt(folder / "truth.txt") @ rigid(turn, 0.0).T
-    source = turn.apply(source)
-    found = idam.register(source, target)
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [2.0, -1.0, 1.5]], ids=["as shipped", "turned"])
+def test_shipped_scans(turn: list[float]) -> None:
+    folder = resources.files("idam.demo")
+    with resources.as_file(folder / "source.ply") as source, resources.as_file(folder / "target.ply") as target:
+        clouds = [read_point_cloud(path).points for path in (source, target)]
+    matrix = motion(turn, [0.0, 0.0, 0.0])
+    truth = np.loadtxt(str(resources.files("idam.lab.data") / "demo" / "truth.txt")) @ matrix.T
+    source_points = move(matrix, clouds[0])
+    found = idam.register(source_points, clouds[1])
     assert degrees(found.transformation, truth) < 5.0
-    assert np.linalg.norm(found.apply(source.mean(0)) - move(truth, source.mean(0))) < 0.01
-    assert found.fitness > 0.5
+    centre = source_points.mean(0)
+    assert np.linalg.norm(found.apply(centre) - move(truth, centre)) < 0.01
+    assert found.fitness > 0.4
     assert found.confidence > 0.5

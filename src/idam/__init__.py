@@ -5,25 +5,39 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from idam.errors import InputError, MissingDependencyError
-from idam.result import RegistrationResult
 
 if TYPE_CHECKING:
-    from idam.network.pretrained import list_models, load_model
-    from idam.registration import register
+    from idam.clouds.prepared import Prepared
+    from idam.network.pretrained import load_model
+    from idam.registration import prepare, register
+    from idam.result import RegistrationResult
+    from idam.weights import list_models
 
-__all__ = ["InputError", "MissingDependencyError", "RegistrationResult", "list_models", "load_model", "register"]
+__all__ = [
+    "InputError",
+    "MissingDependencyError",
+    "Prepared",
+    "RegistrationResult",
+    "list_models",
+    "load_model",
+    "prepare",
+    "register",
+]
 
 __version__ = "0.1.0"
 
 _LATE = {
-    "register": "idam.registration",
-    "list_models": "idam.network.pretrained",
+    "Prepared": "idam.clouds.prepared",
+    "RegistrationResult": "idam.result",
+    "list_models": "idam.weights",
     "load_model": "idam.network.pretrained",
+    "prepare": "idam.registration",
+    "register": "idam.registration",
 }
 
 
 def __getattr__(name: str) -> Any:
-    # these import torch, which takes seconds: only when first used
+    # imported when first used: the command line's help needs none of these, and load_model needs PyTorch
     if name not in _LATE:
         raise AttributeError(f"module 'idam' has no attribute {name!r}")
     from importlib import import_module

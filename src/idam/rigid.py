@@ -19,6 +19,7 @@ __all__ = [
     "adjoint",
     "angle",
     "apply",
+    "carried",
     "exp",
     "inverse",
     "log",
@@ -124,6 +125,13 @@ def adjoint(matrix: Array) -> Array:
     full[..., :3, :3] = full[..., 3:, 3:] = rotation
     full[..., 3:, :3] = skew(matrix[..., :3, 3]) @ rotation
     return full
+
+
+def carried(information: Array, change: Array) -> Array:
+    """An information matrix (6, 6) of a twist x, as that of the twist y = C x, with ``change`` C (6, 6)."""
+    back = np.linalg.inv(change)
+    result = back.T @ information @ back
+    return np.asarray((result + result.T) / 2)
 
 
 def nearest_rotation(matrix: Array) -> Array:

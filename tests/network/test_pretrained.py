@@ -4,15 +4,17 @@ import os
 import stat
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
+from idam import weights
 from idam.errors import InputError
-from idam.network import pretrained
 from idam.network.config import Config
 from idam.network.model import IDAM
-from idam.network.pretrained import list_models, load_model, provenance, save_model
+from idam.network.pretrained import load_model, save_model
+from idam.weights import list_models, provenance, read_weights
 
 CONFIG = Config(neighbours=5, channels=8, blocks=2, iterations=4, keep=0.3, soft_matches=True)
 HISTORY = {"experiment": "unseen-shapes", "steps": 1000, "validation": {"mae_r": 0.1}}
@@ -35,8 +37,8 @@ def shipped(path: Path, model: IDAM, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of shipped models with two in it."""
     save_model(path.with_name("another.safetensors"), model, {})
     path.with_name("notes.txt").touch()
-    monkeypatch.setattr(pretrained, "_folder", lambda: path.parent)
-    monkeypatch.setattr(pretrained, "DEFAULT", "small")
+    monkeypatch.setattr(weights, "FOLDER", path.parent)
+    monkeypatch.setattr(weights, "DEFAULT", "small")
     return path.parent
 
 
@@ -53,6 +55,34 @@ def test_a_loaded_model_is_ready_for_use(path):
     loaded = load_model(str(path), device="cpu")
     assert not any(module.training for module in loaded.modules())
     assert not any(p.requires_grad for p in loaded.parameters())
+
+
+def test_loading_leaves_the_random_state_alone(path):
+    before = torch.get_rng_state()
+    load_model(path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("name", ["general", "gnn-unseen-shapes", "fpfh-unseen-shapes"])
+def test_the_default_dtype_does_not_matter(name, randn):
+    clouds = randn(1, 100, 3, dtype=torch.float32), randn(1, 90, 3, dtype=torch.float32)
+    expected = load_model(name)(*clouds).rotation
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = load_model(name)(*clouds).rotation
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(found, expected)
+
+
+def test_weights_without_effect_are_saved_as_zeros(path, model):
+    weight = model.validity[0].mlp[1].weight
+    with torch.no_grad():
+        weight[0, :3] = torch.tensor([1e-40, -1e-13, 1e-6])
+    save_model(path, model, {})
+    saved = read_weights(path)[1]["validity.0.mlp.1.weight"]
+    assert saved[0, :3].tolist() == [0, 0, np.float32(1e-6)]
+    assert saved[0, 3:].tolist() == weight[0, 3:].tolist()
 
 
 def test_the_provenance_tells_the_history_and_the_configuration(path):

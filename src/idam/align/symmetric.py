@@ -9,18 +9,14 @@ rests where points of both lie evenly, for a small part of their whole distance 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-if TYPE_CHECKING:
-    from idam.align import Refinable
+from idam import rigid
+from idam.clouds.surfaces import Surfaces
+from idam.describe.products import gram
+from idam.rigid import Array
 
 __all__ = ["symmetric_icp"]
-
-Points = NDArray[np.float64]
 
 OFF = 0.4
 """Share of the reach that two points lie off a common surface by where they have lost three quarters of their pull."""
@@ -32,52 +28,45 @@ STILL = 1e-5
 """Length of the step, in radians and working units, from which on it is done."""
 
 
-def symmetric_icp(
-    source: Refinable, target: Refinable, start: Points, distance: float, iterations: int
-) -> tuple[Points, NDArray[np.float64]]:
+def symmetric_icp(surfaces: Surfaces, start: Array, distance: float, iterations: int) -> Array:
     """Improve a transform (4, 4) that is nearly right. Each point of either cloud is paired with the other's nearest.
 
     Args:
-        source: in working coordinates.
-        target: likewise.
+        surfaces: in working coordinates.
         start: where to begin.
         distance: points further apart do not pull on each other, nearer ones the more.
         iterations: at most.
 
     Returns:
-        The transform (4, 4), and the information matrix (6, 6), rotation before translation.
+        The transform (4, 4).
     """
-    transformation, information = start, np.zeros((6, 6))
+    transformation = start
     for _ in range(iterations):
-        step, information = _step(source, target, transformation, distance)
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        moved = np.eye(4)
-        moved[:3, :3] = turn @ transformation[:3, :3]
-        moved[:3, 3] = turn @ transformation[:3, 3] + step[3:]
-        transformation = moved
+        step = _step(surfaces, transformation, distance)
+        turn = rigid.rotation_exp(step[:3])
+        transformation = rigid.transform(turn @ transformation[:3, :3], turn @ transformation[:3, 3] + step[3:])
         if np.abs(step).max() < STILL:
             break
-    return transformation, information
+    return transformation
 
 
-def _step(source: Refinable, target: Refinable, transformation: Points, reach: float) -> tuple[Points, Points]:
-    """One step of Gauss and Newton, a rotation vector and a translation, (6,), and the matrix (6, 6) it solves."""
-    rotation, translation = transformation[:3, :3], transformation[:3, 3]
-    moved, normals = source.points @ rotation.T + translation, source.normals @ rotation.T
-    to_target, row = target.search.query(moved, distance_upper_bound=reach)
-    to_source, column = source.search.query((target.points - translation) @ rotation, distance_upper_bound=reach)
-    mine, theirs = np.flatnonzero(np.isfinite(to_target)), np.flatnonzero(np.isfinite(to_source))
-    i, j = np.concatenate([mine, column[theirs]]), np.concatenate([row[mine], theirs])
-    distance = np.concatenate([to_target[mine], to_source[theirs]])
-    p, n, m = moved[i], normals[i], target.normals[j]
+def _step(surfaces: Surfaces, transformation: Array, reach: float) -> Array:
+    """One step of Gauss and Newton, a rotation vector and a translation, (6,), to apply after the transform."""
+    spacings = reach / surfaces.spacing
+    to_target, mine, row = surfaces.touching(transformation, spacings)
+    to_source, theirs, column = surfaces.swapped().touching(rigid.inverse(transformation), spacings)
+    i, j = np.concatenate([mine, column]), np.concatenate([row, theirs])
+    distance = np.concatenate([to_target, to_source])
+    p = rigid.apply(transformation, surfaces.source.points[i])
+    n, m = surfaces.source.normals[i] @ transformation[:3, :3].T, surfaces.target.normals[j]
     cosine = (n * m).sum(1)
     normal = n * np.copysign(1.0, cosine)[:, None] + m
     normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-9)
     # along the normal, and along each axis
     directions = np.concatenate([normal[None], np.broadcast_to(np.eye(3)[:, None], (3, len(p), 3))])
-    residual = ((p - target.points[j]) * directions).sum(-1)
+    residual = ((p - surfaces.target.points[j]) * directions).sum(-1)
     weight = (1 - (distance / reach) ** 2) * (1 + (residual[0] / (OFF * reach)) ** 2) ** -2.0 * cosine**2
     gradient = np.concatenate([np.cross(p, directions), directions], -1).reshape(-1, 6)
     weighted = gradient * (np.array([1.0, PULL, PULL, PULL])[:, None] * weight).reshape(-1, 1)
-    information = gradient.T @ weighted
-    return np.linalg.solve(information + DAMPING * np.eye(6), -(weighted.T @ residual.ravel())), information
+    system = gram(weighted, np.concatenate([gradient, residual.reshape(-1, 1)], 1))
+    return np.linalg.solve(system[:, :6] + DAMPING * np.eye(6), -system[:, 6])

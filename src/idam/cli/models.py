@@ -7,7 +7,7 @@ __all__ = ["models"]
 
 def models() -> None:
     """List the shipped models: what they were trained on and how they did."""
-    from idam.network.pretrained import list_models, provenance
+    from idam.weights import list_models, provenance
 
     for name in list_models():  # no table: names and commands are to be copied, whatever the terminal's width
         history = provenance(name)

@@ -38,7 +38,7 @@ def register(
         float | None, typer.Option(help="Distance for fitness and RMSE; from the data if left out.")
     ] = None,
     refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point, symmetric or none.")] = "gicp",
-    seed: Annotated[int, typer.Option(help="Of the starting rotations.")] = 0,
+    seed: Annotated[int, typer.Option(help="Has no effect: nothing is drawn at random.")] = 0,
     device: Annotated[str, typer.Option(help="Where the network runs.")] = "cpu",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the 4x4 alone, for scripts.")] = False,
     verbose: Annotated[
@@ -86,7 +86,7 @@ def register(
             max_angle=max_angle,
             voxel_size=voxel_size,
             max_correspondence_distance=max_correspondence_distance,
-            refine=refine,
+            refine=refine,  # type: ignore[arg-type] # register says which there are
             seed=seed,
             device=device,
         )

@@ -1,4 +1,4 @@
-"""Two clouds at several resolutions, each for one purpose."""
+"""Two clouds at several resolutions, each for one purpose, in working coordinates."""
 
 from __future__ import annotations
 
@@ -7,128 +7,178 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from idam.align import Refinable, Surfaces
-from idam.clouds.frame import MIN_POINTS, choose_voxel_size, downsample
+from idam import rigid
+from idam.clouds.frame import MIN_POINTS
+from idam.clouds.prepared import ALL, FINE, LARGER, SMALL, Level, Prepared
+from idam.clouds.surfaces import Surfaces
+from idam.clouds.viewpoint import FreeSpace
+from idam.describe.invariant import Descriptor
 from idam.errors import InputError
+from idam.rigid import Array
 
-__all__ = ["Level", "Pyramid", "build_pyramid", "level", "spacing_of"]
+__all__ = ["PairLevel", "Pyramid"]
 
-Points = NDArray[np.float64]
-
-NETWORK_POINTS = 1024
-"""Points of the larger cloud that the network sees: what it was trained on."""
-MATCHING_POINTS = 2000
-"""Points of the larger cloud that features are matched on."""
 MOST_POINTS = 4096
 """Points of either cloud at most that features are matched on, where the caller chooses the voxel size."""
-FINE_POINTS = 10_000
-"""Points of the larger cloud that the last refinement uses."""
-SAMPLE = 1000
-"""Points at least whose nearest neighbours tell the spacing of a cloud."""
 FINEST = 1e-4
 """Smallest voxel size, in working units: far below the spacing of the fine clouds, and small_gicp's grid has room."""
+MARGIN = 2.0
+"""Spacings of the fine clouds by which a point lies in front of a surface for it to contradict a transform."""
+ODD_SIZES = 50.0
+"""Ratio of two clouds' sizes from which on their units are probably not the same."""
 
 
 @dataclass(frozen=True)
-class Level:
-    """Both clouds at one resolution, in working coordinates, and the spacing of their points."""
+class PairLevel:
+    """Both clouds at one resolution.
 
-    source: Points
-    target: Points
-    spacing: float
+    Attributes:
+        source_level: the source.
+        target_level: the target.
+        unit: input units in one working unit.
+        free_space: what the scans saw through.
+    """
+
+    source_level: Level
+    target_level: Level
+    unit: float
+    free_space: FreeSpace
 
     @cached_property
     def surfaces(self) -> Surfaces:
-        """The clouds with normals, ready for refinement."""
-        return Surfaces(Refinable.build(self.source), Refinable.build(self.target), self.spacing)
+        """The clouds in working coordinates, with normals."""
+        return Surfaces(self.source_level.surface(self.unit), self.target_level.surface(self.unit), self.spacing)
+
+    @property
+    def source(self) -> Array:
+        """The source's points (N, 3) in working coordinates."""
+        return self.surfaces.source.points
+
+    @property
+    def target(self) -> Array:
+        """The target's points (P, 3) in working coordinates."""
+        return self.surfaces.target.points
+
+    @cached_property
+    def spacing(self) -> float:
+        """Of the sparser cloud's points, in working units."""
+        return max(self.source_level.spacing, self.target_level.spacing) / self.unit
 
     @property
     def size(self) -> int:
         """Points of the larger cloud."""
-        return max(len(self.source), len(self.target))
+        return max(len(self.source_level.points), len(self.target_level.points))
 
-    def swapped(self) -> Level:
-        """With source and target exchanged."""
-        return Level(self.target, self.source, self.spacing)
+    def features(self, descriptor: Descriptor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """What a descriptor makes of the source's and the target's points, (N, K) and (P, K), at one spacing."""
+        spacing = max(level.spacing_rung for level in (self.source_level, self.target_level))
+        return self.source_level.described(descriptor, spacing), self.target_level.described(descriptor, spacing)
 
 
 @dataclass(frozen=True)
 class Pyramid:
     """Both clouds at the resolutions that features are matched on, and at that of the last refinement.
 
+    Working coordinates are relative to each cloud's own centre, in units about the radius of the larger cloud: a power
+    of two, so that no digit changes.
+
     Attributes:
-        small: what the network sees, and what is matched first.
-        fine: for the last refinement.
-        all_small: whether there are no larger clouds to match: the small ones hold all points, or the caller chose
-            them.
-        exchanged: whether what is called the source here is the caller's target.
+        source: the smaller cloud, or the one that is called the source.
+        target: the other.
+        voxel_size: of the clouds to match, in input units; None to take it from the data.
     """
 
-    small: Level
-    fine: Level
-    all_small: bool = False
-    exchanged: bool = False
+    source: Prepared
+    target: Prepared
+    voxel_size: float | None = None
 
     @cached_property
-    def larger(self) -> Level:
-        """What is matched where the small clouds do not settle the matter: made only then."""
-        return self.small if self.all_small else level(self.fine.source, self.fine.target, MATCHING_POINTS)
+    def unit(self) -> float:
+        """Input units in one working unit."""
+        return max(self.source.unit, self.target.unit)
 
-    def swapped(self) -> Pyramid:
-        """With source and target exchanged."""
-        return Pyramid(self.small.swapped(), self.fine.swapped(), self.all_small, not self.exchanged)
+    @cached_property
+    def small(self) -> PairLevel:
+        """What is matched first.
 
+        Raises:
+            InputError: too few or too many points are left to match.
+        """
+        level = (
+            self.with_points(SMALL) if self.voxel_size is None else self.at(max(self.voxel_size, FINEST * self.unit))
+        )
+        self._check(level)
+        return level
 
-def build_pyramid(source: Points, target: Points, voxel_size: float | None) -> Pyramid:
-    """The clouds at all resolutions.
+    @cached_property
+    def larger(self) -> PairLevel:
+        """What is matched where the small clouds do not settle the matter."""
+        return self.small if self.all_small else self.with_points(LARGER)
 
-    Args:
-        source: working points (N, 3).
-        target: working points (P, 3).
-        voxel_size: of the clouds to match, in working units; None to take it from the data.
+    @cached_property
+    def fine(self) -> PairLevel:
+        """What the last refinement uses."""
+        return self.with_points(FINE)
 
-    Raises:
-        InputError: too few or too many points are left to match.
-    """
-    fine = level(source, target, FINE_POINTS)
-    if voxel_size is None:
-        small = level(fine.source, fine.target, NETWORK_POINTS)
-        _check_number(small.source, small.target)
-        return Pyramid(small, fine, all_small=fine.size <= NETWORK_POINTS)
-    voxel_size = max(voxel_size, FINEST)
-    few = downsample(fine.source, voxel_size), downsample(fine.target, voxel_size)
-    _check_number(*few)
-    return Pyramid(Level(few[0], few[1], max(map(spacing_of, few))), fine, all_small=True)
+    @property
+    def all_small(self) -> bool:
+        """Whether there are no larger clouds to match: the small ones hold all points, or the caller chose them."""
+        return self.voxel_size is not None or self.small.source_level.voxel_size == ALL
 
+    def with_points(self, count: int) -> PairLevel:
+        """Both clouds on the voxel grid that leaves about ``count`` points of the larger."""
+        return self.at(max(cloud.voxel_size(count) for cloud in (self.source, self.target)))
 
-def _check_number(source: Points, target: Points) -> None:
-    for name, points in (("source", source), ("target", target)):
-        if len(points) < MIN_POINTS:
-            raise InputError(
-                f"{name}: {len(points)} points are left at the network's resolution, at least {MIN_POINTS} are needed; "
-                "crop the other cloud to its size, or give a smaller voxel_size"
-            )
-        if len(points) > MOST_POINTS:
-            raise InputError(
-                f"{name}: {len(points)} points are left at this voxel_size, at most {MOST_POINTS} fit the network; "
-                "give a larger voxel_size"
-            )
+    def at(self, voxel_size: float) -> PairLevel:
+        """Both clouds on a voxel grid, its size in input units."""
+        return PairLevel(self.source.level(voxel_size), self.target.level(voxel_size), self.unit, self.free_space)
 
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """What the scans saw through, asked of the fine clouds."""
+        voxel_size = max(cloud.voxel_size(FINE) for cloud in (self.source, self.target))
+        levels = [cloud.level(voxel_size) for cloud in (self.source, self.target)]
+        depths = [cloud.depth and cloud.depth.scaled(self.unit) for cloud in (self.source, self.target)]
+        margin = MARGIN * max(level.spacing for level in levels) / self.unit
+        return FreeSpace(levels[0].points / self.unit, levels[1].points / self.unit, depths[0], depths[1], margin)
 
-def level(source: Points, target: Points, count: int) -> Level:
-    """Both clouds on one voxel grid that leaves about ``count`` points of the larger."""
-    voxel_size = choose_voxel_size([source, target], count)
-    if voxel_size > 0:
-        source, target = downsample(source, voxel_size), downsample(target, voxel_size)
-    else:  # a voxel grid merges copies of a point, too
-        source, target = np.unique(source, axis=0), np.unique(target, axis=0)
-    return Level(source, target, max(spacing_of(source), spacing_of(target)))
+    def leave(self, working: Array) -> Array:
+        """A working transform (..., 4, 4) as one from source to target in the input's coordinates."""
+        rotation = working[..., :3, :3]
+        shift = self.target.centre + self.unit * working[..., :3, 3] - rotation @ self.source.centre
+        return rigid.transform(rotation, shift)
 
+    def enter(self, full: Array) -> Array:
+        """The inverse of :meth:`leave`."""
+        rotation = full[..., :3, :3]
+        shift = (full[..., :3, 3] + rotation @ self.source.centre - self.target.centre) / self.unit
+        return rigid.transform(rotation, shift)
 
-def spacing_of(points: Points) -> float:
-    """The median distance of a point of (N, 3) to its nearest neighbour at another place, of some of the points."""
-    some = points[:: max(1, len(points) // SAMPLE)]
-    distance = cKDTree(points, compact_nodes=False, balanced_tree=False).query(some, k=2)[0][:, 1]
-    return float(np.median(distance[distance > 0]))
+    def information_left(self, working: Array) -> Array:
+        """The information (6, 6) of a working transform T exp(x) as that of the one in the input's coordinates.
+
+        The input's x lives in the source's own frame, its translation in input units.
+        """
+        to_input = rigid.adjoint(rigid.transform(np.eye(3), self.source.centre))
+        return rigid.carried(working, to_input @ np.diag([1.0, 1.0, 1.0, self.unit, self.unit, self.unit]))
+
+    def _check(self, level: PairLevel) -> None:
+        both = (self.source, level.source_level), (self.target, level.target_level)
+        for (cloud, thinned), (other, _) in zip(both, reversed(both), strict=True):
+            left, ratio = len(thinned.points), other.radius / cloud.radius
+            if left < MIN_POINTS and ratio > ODD_SIZES:
+                raise InputError(
+                    f"{other.name}: {ratio:.3g} times the size of {cloud.name}; if their units differ, scale one of "
+                    "them, or crop the larger cloud to the other's size"
+                )
+            if left < MIN_POINTS:
+                raise InputError(
+                    f"{cloud.name}: {left} points are left at a voxel size of {thinned.voxel_size:.3g}, at least "
+                    f"{MIN_POINTS} are needed; crop the other cloud to its size, or give a smaller voxel_size"
+                )
+            if left > MOST_POINTS:
+                raise InputError(
+                    f"{cloud.name}: {left} points are left at this voxel_size, at most {MOST_POINTS} can be matched; "
+                    "give a larger voxel_size"
+                )

@@ -11,11 +11,15 @@ from torch import Tensor, nn
 from idam.network.ablation import EqualValidity, InnerProduct, RandomSignificance
 from idam.network.config import Config
 from idam.network.elimination import Significance, Validity, hybrid_weights, keep_most_significant
-from idam.network.features import build_features
+from idam.network.features import GNN, build_features
 from idam.network.geometry import apply_transform, compose, gather_points, weighted_procrustes
 from idam.network.similarity import SimilarityConvolution
 
 __all__ = ["IDAM", "Iteration", "KeyPoints", "Output"]
+
+
+Graphs = tuple[Tensor, Tensor] | None
+"""Neighbours in the source (B, N, K) and in the target (B, P, K)."""
 
 
 @dataclass(frozen=True)
@@ -111,24 +115,27 @@ class IDAM(nn.Module):
             Validity(channels) if self.config.hybrid_elimination else EqualValidity() for _ in blocks
         )
 
-    def forward(self, source: Tensor, target: Tensor) -> Output:
-        """Register batches of clouds: the transform that lays each source on its target (figure 2).
+    def forward(self, source: Tensor, target: Tensor, neighbours: Graphs = None) -> Output:
+        """Register batches of clouds: the transform that moves each source onto its target (figure 2).
 
         Args:
             source: (B, N, 3), scaled like the training data (about the unit sphere).
             target: (B, P, 3); P may differ from N.
+            neighbours: of GNN features, the rows of each point's K nearest others, (B, N, K) and (B, P, K); None to
+                search for them (:meth:`idam.network.features.gnn.GNN.graph`).
 
         Returns:
             The transform, with everything each iteration saw. Scores and validity are differentiable in the weights;
             the transform is not: no gradient passes the SVD (section 3.4).
         """
-        features = self.encode(source, target)
+        neighbours = self.graphs(source, target) if neighbours is None else neighbours
+        features = self.encode(source, target, neighbours)
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
         for keep, onwards in product(self.config.keep_again, (False, True)):
             if bool((output.trust >= self.config.trusted).all()):
                 break
             if onwards:
-                again = self._from_the_best(source, target, features, keep, output)
+                again = self._from_the_best(source, target, features, neighbours, keep, output)
             else:
                 again = self._from_the_start(source, target, features, keep)
             output = better(output, again, self.config.trusted)
@@ -140,23 +147,42 @@ class IDAM(nn.Module):
         return self.match(*keys, 2 * self.config.iterations)
 
     def _from_the_best(
-        self, source: Tensor, target: Tensor, features: tuple[Tensor, Tensor], keep: float, best: Output
+        self,
+        source: Tensor,
+        target: Tensor,
+        features: tuple[Tensor, Tensor],
+        neighbours: Graphs,
+        keep: float,
+        best: Output,
     ) -> Output:
         """Another try from where the best one led: features that turn with the cloud are more alike there."""
         moved = apply_transform(source, best.rotation, best.translation)
-        moved_features = features[0] if self.features.rotation_invariant else self.features(moved)
+        moved_features = features[0]
+        if not self.features.rotation_invariant:
+            moved_features = self.describe(moved, None if neighbours is None else neighbours[0])
         step = self._from_the_start(moved, target, (moved_features, features[1]), keep)
         with torch.autocast(source.device.type, enabled=False):
             rotation, translation = compose(step.rotation, step.translation, best.rotation, best.translation)
         keys = replace(step.source, points=gather_points(source, step.source.index))
         return replace(step, rotation=rotation, translation=translation, source=keys)
 
-    def encode(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    def graphs(self, source: Tensor, target: Tensor) -> Graphs:
+        """The neighbours that features of both clouds are built on, which no rigid motion changes; None without any."""
+        return (self.features.graph(source), self.features.graph(target)) if isinstance(self.features, GNN) else None
+
+    def describe(self, points: Tensor, neighbours: Tensor | None) -> Tensor:
+        """Features (B, N, K) of points (B, N, 3)."""
+        features: Tensor = self.features(points) if neighbours is None else self.features(points, neighbours)
+        return features
+
+    def encode(self, source: Tensor, target: Tensor, neighbours: Graphs = None) -> tuple[Tensor, Tensor]:
         """Features (B, N, K) and (B, P, K) of both clouds; equally large clouds go through as one batch."""
+        near, other = neighbours or (None, None)
         if source.shape == target.shape:
-            source_features, target_features = self.features(torch.cat([source, target])).chunk(2)
+            both = None if near is None or other is None else torch.cat([near, other])
+            source_features, target_features = self.describe(torch.cat([source, target]), both).chunk(2)
             return source_features, target_features
-        return self.features(source), self.features(target)
+        return self.describe(source, near), self.describe(target, other)
 
     def eliminate(self, points: Tensor, features: Tensor, keep: float | None = None) -> KeyPoints:
         """Hard elimination: the most significant of the points (B, N, 3) with features (B, N, K)."""

@@ -1,47 +1,40 @@
-"""The shipped models: names, weights, configuration and provenance, all in one safetensors file each."""
+"""Models in torch, from weights and back: the files are those of :mod:`idam.weights`."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
-from importlib import resources
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor, nn
+from numpy.typing import NDArray
+from safetensors.numpy import save
+from torch import nn
 
 from idam.errors import InputError
 from idam.io.files import write_bytes
 from idam.network.config import Config
 from idam.network.model import IDAM
+from idam.weights import UNREADABLE, find, not_a_model, read_weights, without_denormals
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["UNREADABLE", "list_models", "load_model", "provenance", "read_weights", "save_model", "save_weights"]
-
-DEFAULT = "general"
-"""The model behind the name ``default``: for scans of any kind, in any pose."""
-
-
-UNREADABLE = (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError)
-"""What reading weights raises where the file is something else or of another network."""
-
-
-def list_models() -> list[str]:
-    """Names of the shipped models, for :func:`load_model`."""
-    return sorted(Path(entry.name).stem for entry in _folder().iterdir() if entry.name.endswith(".safetensors"))
+__all__ = ["cached_model", "load_model", "restore", "save_model", "save_weights"]
 
 
 def load_model(name: str | os.PathLike[str] = "default", device: str | torch.device | None = None) -> IDAM:
-    """A model with its weights, in evaluation mode.
+    """A model with its weights, in single precision and evaluation mode.
+
+    Neither torch's random state nor its default dtype matters, and neither changes.
 
     Args:
-        name: one of :func:`list_models`, ``default``, or the path of a ``.safetensors`` file that ``idam train`` wrote.
+        name: one of :func:`idam.list_models`, ``default``, or the path of a ``.safetensors`` file that ``idam train``
+            wrote.
         device: where to put it; the CPU if None.
 
     Raises:
@@ -49,12 +42,12 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
     """
     path = find(name)
     try:
-        config, state = read_weights(path)
-        model = IDAM(Config(**config))
-        model.load_state_dict(state)
+        config, weights = read_weights(path)
+        with torch.device("meta"):  # draws no random weights
+            model = IDAM(Config(**config))
+        restore(model, weights)
     except UNREADABLE as error:
-        reason = str(error).splitlines()[0][:120]
-        raise InputError(f"{path}: not a model that idam wrote ({reason}); use one of {_names()}") from None
+        raise not_a_model(path, error) from None
     try:
         return model.eval().requires_grad_(False).to(device or "cpu")
     except (RuntimeError, AssertionError) as error:
@@ -62,15 +55,21 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
         raise InputError(f"device {str(device)!r} cannot be used ({reason}); leave it out for the CPU") from None
 
 
-def provenance(name: str | os.PathLike[str]) -> dict[str, Any]:
-    """How a model came about: experiment, data, seed, command, commit, steps and scores."""
-    path = find(name)
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-        return {"config": _config(metadata), **json.loads(metadata.get("provenance", "{}"))}
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: not a model that idam wrote ({error})") from None
+def cached_model(name: str | os.PathLike[str], device: str | None = None) -> IDAM:
+    """:func:`load_model`, read again only where the file has changed."""
+    path = find(name).resolve()
+    status = path.stat()
+    return _cached(path, status.st_mtime_ns, status.st_size, device)
+
+
+@lru_cache(4)
+def _cached(path: Path, modified: int, size: int, device: str | None) -> IDAM:
+    return load_model(path, device)
+
+
+def restore(network: nn.Module, weights: Mapping[str, NDArray[Any]]) -> None:
+    """Give a network the weights that were read; raise RuntimeError where they are another network's."""
+    network.load_state_dict({key: torch.tensor(value) for key, value in weights.items()}, assign=True)
 
 
 def save_model(path: Path, model: IDAM, provenance: dict[str, Any]) -> None:
@@ -88,45 +87,6 @@ def save_weights(path: Path, network: nn.Module, config: DataclassInstance, prov
     Raises:
         InputError: the file cannot be written.
     """
-    state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
+    weights = without_denormals({key: value.detach().cpu().numpy() for key, value in network.state_dict().items()})
     metadata = {"config": json.dumps(asdict(config)), "provenance": json.dumps(provenance)}
-    write_bytes(path, save(state, metadata))
-
-
-def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The configuration and the weights that :func:`save_weights` wrote; raise one of UNREADABLE where it did not."""
-    with safe_open(path, "pt") as file:
-        metadata = file.metadata() or {}
-        state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    return _config(metadata), state
-
-
-def find(name: str | os.PathLike[str]) -> Path:
-    """The file of a model.
-
-    Raises:
-        InputError: there is no such model.
-    """
-    if os.fspath(name) == "default":
-        name = DEFAULT
-    path = Path(name)
-    if path.suffix != ".safetensors":
-        path = Path(str(_folder() / f"{os.fspath(name)}.safetensors"))
-    if not path.is_file():
-        raise InputError(
-            f"unknown model {os.fspath(name)!r}: use one of {_names()}, or the path of a .safetensors file"
-        )
-    return path
-
-
-def _config(metadata: dict[str, str]) -> dict[str, Any]:
-    """Arguments of :class:`Config`; JSON knows no tuples."""
-    return {key: tuple(x) if isinstance(x, list) else x for key, x in json.loads(metadata["config"]).items()}
-
-
-def _names() -> str:
-    return ", ".join(["default", *list_models()])
-
-
-def _folder() -> Any:
-    return resources.files("idam") / "weights"
+    write_bytes(path, save(weights, metadata))

@@ -9,17 +9,14 @@ for two that agree by chance, so that even a few per cent of right matches stand
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from idam.network.geometry import gather_points, weighted_procrustes
-from idam.network.propose import as_transforms
+from idam import rigid
+from idam.describe.products import product
+from idam.rigid import Array
 from idam.search.matching import FeatureMatches
 
-__all__ = ["agreeing_transforms"]
-
-Points = NDArray[np.float64]
+__all__ = ["agreeing_transforms", "weighted_procrustes"]
 
 COMPANIONS = 20
 """Matches that a seed's first transform is solved from, besides itself."""
@@ -27,45 +24,79 @@ ROUNDS = 3
 """Times a seed's transform is solved anew, from the matches that it brings together."""
 
 
-@torch.inference_mode()
-def agreeing_transforms(matches: FeatureMatches, seeds: int) -> list[Points]:
-    """Transforms (4, 4) that sets of matches agree on, the largest set first; many are alike.
+def agreeing_transforms(matches: FeatureMatches, seeds: int) -> Array:
+    """Transforms (S, 4, 4) that sets of matches agree on, the largest set first; many are alike.
 
     Args:
         matches: of which some are right; where there are fewer than three, they agree on nothing.
         seeds: matches, the most compatible ones, from each of which a set of agreeing ones is grown.
     """
-    source, target, tolerance = matches.source, matches.target, matches.tolerance
+    source, target = matches.source, matches.target
     if len(source) < 3:
-        return []
-    second_order = _second_order_compatibility(source, target, tolerance)
-    seed = second_order.sum(1).sort(descending=True, stable=True).indices[:seeds]
-    weight, companion = second_order[seed].topk(min(COMPANIONS, len(source)), 1)
-    index = torch.cat([seed[:, None], companion], 1)
+        return np.empty((0, 4, 4))
+    second_order = _second_order_compatibility(source, target, matches.tolerance)
+    seed = np.argsort(-second_order.sum(1), kind="stable")[:seeds]
+    last = min(COMPANIONS, len(source)) - 1
+    companion = np.argpartition(-second_order[seed], last, axis=1)[:, : last + 1]
+    index = np.concatenate([seed[:, None], companion], 1)
+    weight = np.take_along_axis(second_order[seed], companion, 1)
     # the seed itself is compatible with whatever its best companion is
-    weight = torch.cat([weight[:, :1], weight], 1)
-    sources, targets = (points.expand(len(seed), -1, -1) for points in (source, target))
-    rotation, translation = weighted_procrustes(gather_points(sources, index), gather_points(targets, index), weight)
+    weight = np.concatenate([weight.max(1, keepdims=True), weight], 1)
+    transforms = weighted_procrustes(source[index], target[index], weight.astype(np.float64))
     for _ in range(ROUNDS):
-        together = _brought_together(sources, targets, rotation, translation, tolerance)
-        rotation, translation = weighted_procrustes(sources, targets, together)
-    number = _brought_together(sources, targets, rotation, translation, tolerance).sum(1)
-    order = number.sort(descending=True, stable=True).indices
-    return as_transforms(rotation[order], translation[order])
+        transforms = weighted_procrustes(source, target, _together(matches, transforms))
+    number = _together(matches, transforms).sum(1)
+    return transforms[np.argsort(-number, kind="stable")]
 
 
-def _second_order_compatibility(source: Tensor, target: Tensor, tolerance: float) -> Tensor:
+def weighted_procrustes(source: Array, target: Array, weight: Array) -> Array:
+    """The rigid transforms (S, 4, 4) minimising ``sum_i w_i |R p_i + t - q_i|^2`` (section 3.3.2, equation 8).
+
+    Both clouds are centred on their weighted means: with plain means the optimum is another one.
+
+    Args:
+        source: points p, (S, N, 3), or (N, 3) where they are the same for all.
+        target: their matches q, likewise.
+        weight: non-negative, (S, N), of any scale; where all are zero, they count as equal.
+    """
+    total = weight.sum(-1, keepdims=True)
+    weight = np.where(total > 0, weight / np.where(total > 0, total, 1.0), 1.0 / weight.shape[-1])
+    if source.ndim == 2:  # one cloud for all: moments are one product
+        products = (source[:, :, None] * target[:, None, :]).reshape(len(source), 9)
+        moments = product(weight, np.concatenate([source, target, products], 1))
+        source_mean, target_mean = moments[:, :3], moments[:, 3:6]
+        covariance = moments[:, 6:].reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None, :]
+    else:
+        source_mean, target_mean = (np.einsum("sn,snd->sd", weight, points) for points in (source, target))
+        centred = weight[:, :, None] * (source - source_mean[:, None])
+        covariance = centred.swapaxes(1, 2) @ (target - target_mean[:, None])
+    u, _, vh = np.linalg.svd(covariance)
+    v = vh.swapaxes(1, 2).copy()
+    v[:, :, 2] *= np.linalg.det(v @ u.swapaxes(1, 2))[:, None]
+    rotation = v @ u.swapaxes(1, 2)
+    return rigid.transform(rotation, target_mean - (rotation @ source_mean[:, :, None])[..., 0])
+
+
+def _second_order_compatibility(source: Array, target: Array, tolerance: float) -> NDArray[np.float32]:
     """For each two compatible matches how many others both are compatible with (M, M); 0 for incompatible ones."""
-    first, second = (torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist") for x in (source, target))
-    difference: Tensor = first - second
-    compatible = (difference.abs() < tolerance).float().fill_diagonal_(0)
-    return compatible * (compatible @ compatible)
+    first, second = (_distances(points) for points in (source, target))
+    compatible = (np.abs(first - second) < tolerance).astype(np.float32)
+    np.fill_diagonal(compatible, 0)
+    second_order: NDArray[np.float32] = compatible * product(compatible, compatible)
+    return second_order
 
 
-def _brought_together(
-    sources: Tensor, targets: Tensor, rotation: Tensor, translation: Tensor, tolerance: float
-) -> Tensor:
+def _together(matches: FeatureMatches, transforms: Array) -> Array:
     """1 for the matches (S, M) that each of S transforms brings within the tolerance, 0 for the others."""
-    moved = sources @ rotation.transpose(-1, -2) + translation.unsqueeze(-2)
-    near: Tensor = (moved - targets).norm(dim=-1) < tolerance
-    return near.float()
+    miss = rigid.apply(transforms, matches.source) - matches.target
+    near: Array = (np.einsum("smd,smd->sm", miss, miss) < matches.tolerance**2).astype(np.float64)
+    return near
+
+
+def _distances(points: Array) -> Array:
+    """Distances (M, M) of points (M, 3) from each other, coordinate by coordinate: an (M, M, 3) array takes longer."""
+    square = np.zeros((len(points), len(points)))
+    for x in points.T:
+        gap = x[:, None] - x
+        square += gap * gap
+    return np.sqrt(square)

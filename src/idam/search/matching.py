@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from idam.align import TOUCHING
-from idam.clouds.pyramid import Level
-from idam.errors import InputError
-from idam.network.ablation import inner_products
-from idam.network.features.invariant import Invariant, Surroundings, surroundings
-from idam.network.model import IDAM
-from idam.network.pretrained import load_model
-from idam.search.overlap import touching
+from idam import rigid
+from idam.clouds.pyramid import PairLevel
+from idam.describe.invariant import Descriptor
+from idam.describe.products import product
+from idam.rigid import Array, Rows
 
 __all__ = ["FeatureMatches", "Matching", "mutual_matches"]
 
-Points = NDArray[np.float64]
+Scores = NDArray[np.float32]
 
-RANK = 2
-"""Two points match where each is among the other's so many best."""
 MATCHES = 600
 """Matches at most, the likeliest: the compatibility matrix grows with their square."""
 TOLERANCE = 1.5
@@ -41,23 +33,16 @@ AGAINST, FOR = -2.0, 4.0
 class FeatureMatches:
     """Points (M, 3) of the source and of the target whose features are alike, and how far right ones may miss."""
 
-    source: Tensor
-    target: Tensor
+    source: Array
+    target: Array
     tolerance: float
 
-    @cached_property
-    def points(self) -> tuple[Points, Points]:
-        """Source and target, (M, 3) each, as every transform is tried on them: in float64."""
-        return self.source.double().numpy(), self.target.double().numpy()
-
-    def weights(self, transformation: Points) -> Points:
+    def weights(self, transformation: Array) -> Array:
         """How well a transform (4, 4) brings each match together, (M,): 1 at no distance, 0 from its reach on."""
-        source, target = self.points
-        moved = source @ transformation[:3, :3].T + transformation[:3, 3]
-        miss = np.linalg.norm(moved - target, axis=1) / (REACH * self.tolerance)
-        return np.asarray((1 - miss**2).clip(0))
+        miss = np.linalg.norm(rigid.apply(transformation, self.source) - self.target, axis=1)
+        return np.asarray((1 - (miss / (REACH * self.tolerance)) ** 2).clip(0))
 
-    def support(self, transformation: Points) -> float:
+    def support(self, transformation: Array) -> float:
         """Share of the matches that a transform (4, 4) brings together, in [0, 1]: low where there are few of them."""
         return float((self.weights(transformation) > 0).sum() / (len(self.source) + FEW))
 
@@ -74,57 +59,38 @@ class Matching:
         matches: the mutual matches.
     """
 
-    clouds: Level
-    score: Tensor
-    row: Tensor
-    column: Tensor
+    clouds: PairLevel
+    score: Scores
+    row: Scores
+    column: Scores
     matches: FeatureMatches
 
     @classmethod
-    @torch.inference_mode()
-    def of(cls, network: IDAM, clouds: Level) -> Matching:
-        """By a network's features, or by those of the model that it names where its own turn with the cloud."""
-        own = network.features
-        features = own if isinstance(own, Invariant) else features_of(network.config.matched_by)
-        points = [torch.as_tensor(cloud, dtype=torch.float32) for cloud in (clouds.source, clouds.target)]
-        score = inner_products(*(described(features, surroundings(cloud, clouds.spacing)) for cloud in points))
-        row, column = score.logsumexp(1), score.logsumexp(0)
-        pairs = mutual_matches(score, row, column)
-        matches = FeatureMatches(points[0][pairs[:, 0]], points[1][pairs[:, 1]], TOLERANCE * clouds.spacing)
+    def of(cls, descriptor: Descriptor, clouds: PairLevel) -> Matching:
+        """By the features of a descriptor: their inner products, over the root of their length."""
+        source, target = clouds.features(descriptor)
+        score = product(source, target.T) / np.float32(source.shape[1] ** 0.5)
+        row, column = _log_sums(score)
+        i, j = mutual_matches(score, row, column)
+        matches = FeatureMatches(clouds.source[i], clouds.target[j], TOLERANCE * clouds.spacing)
         return cls(clouds, score, row, column, matches)
 
-    def likelihood(self, transformation: Points) -> float:
+    def likelihood(self, transformation: Array) -> float:
         """How much likelier the similarity matrix makes what a transform (4, 4) lays together than chance does.
 
         A sum over the source points that the transform lays on the target, of log S(i, j) over its value were all
         points alike, by row or by column, whichever is less; over the number of points of the smaller cloud. Points
         like all others say nothing; those that lie on others unlike them speak against the transform.
         """
-        surfaces = self.clouds.surfaces
-        rows, columns = touching(surfaces.source, surfaces.target, transformation, TOUCHING * self.clouds.spacing)
-        score = self.score[rows, columns]
+        rows, columns = self.clouds.surfaces.alike(transformation)
+        score = self.score[rows, columns].astype(np.float64)
         by_row = score - self.row[rows] + np.log(self.score.shape[1])
         by_column = score - self.column[columns] + np.log(self.score.shape[0])
-        return float(torch.minimum(by_row, by_column).clamp(AGAINST, FOR).sum() / min(self.score.shape))
+        return float(np.minimum(by_row, by_column).clip(AGAINST, FOR).sum() / min(self.score.shape))
 
 
-@lru_cache(2)
-def features_of(model: str) -> Invariant:
-    """Those of a model, on the CPU; raise InputError where they turn with the cloud."""
-    features = load_model(model).features
-    if not isinstance(features, Invariant):
-        raise InputError(f"matched_by={model}: its features turn with the cloud; name a model such as general")
-    return features
-
-
-def described(features: Invariant, around: Surroundings) -> Tensor:
-    """Features (N, K), on the CPU, of a cloud there; worked out where the network is."""
-    device = features.length.device
-    return features.describe(Surroundings(*(x.to(device) for x in around))).cpu()
-
-
-def mutual_matches(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """Rows and columns (M, 2) of scores (N, P) where each is among the other's best, the likeliest first.
+def mutual_matches(score: Scores, row: Scores, column: Scores) -> tuple[Rows, Rows]:
+    """Rows and columns (M,) of scores (N, P) where each is among the other's two best, the likeliest first.
 
     The likelihood of a match is its share of the softmax of its row, the similarity matrix (equation 3), times that of
     the softmax of its column: a point that is like many others is a poor match to all of them.
@@ -134,13 +100,29 @@ def mutual_matches(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
         row: logarithms of the sums of exponentials of the rows, (N,).
         column: likewise of the columns, (P,).
     """
-    best = [
-        torch.zeros_like(score, dtype=torch.bool).scatter_(
-            dim, score.topk(min(RANK, score.shape[dim]), dim).indices, True
-        )
-        for dim in (0, 1)
-    ]
-    pairs = (best[0] & best[1]).nonzero()
-    i, j = pairs.unbind(1)
+    i, j = np.nonzero(_among_best(score) & _among_best(score.T).T)
     likelihood = 2 * score[i, j] - row[i] - column[j]
-    return pairs[likelihood.sort(descending=True, stable=True).indices[:MATCHES]]
+    order = np.argsort(-likelihood, kind="stable")[:MATCHES]
+    return i[order], j[order]
+
+
+def _among_best(score: Scores) -> NDArray[np.bool_]:
+    """Which scores (N, P) are one of the two best in their row."""
+    best = np.zeros(score.shape, bool)
+    rows = np.arange(len(score))
+    first = score.argmax(1)
+    best[rows, first] = True
+    if score.shape[1] > 1:
+        left = score.copy()
+        left[rows, first] = -np.inf
+        best[rows, left.argmax(1)] = True
+    return best
+
+
+def _log_sums(score: Scores) -> tuple[Scores, Scores]:
+    """The logarithms of the sums of exponentials of scores (N, P), by row (N,) and by column (P,).
+
+    Scores are inner products of vectors of one length: their exponentials neither overflow nor vanish.
+    """
+    exponential = np.exp(score)
+    return np.log(exponential.sum(1)), np.log(exponential.sum(0))

@@ -1,89 +1,57 @@
-"""How well a transform explains two clouds, as far as they overlap."""
+"""How much of two clouds a transform lays on each other, and how exactly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from idam.align import Refinable
-from idam.clouds.frame import voxels
+from idam import rigid
+from idam.clouds.surfaces import TOUCHING, Surfaces
+from idam.rigid import Array
 
-__all__ = ["Agreement", "agreement", "inliers", "touching"]
-
-Points = NDArray[np.float64]
-
-SAME_SURFACE = 0.7
-"""|cosine| of the normals from which two near points count as the same surface (45 degrees)."""
-LEAST_CELL = 1e-200
-"""Distance below which even the largest coordinates divided by it overflow."""
+__all__ = ["exactness", "overlap", "shares"]
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """The overlap of two clouds under a transform.
+def shares(surfaces: Surfaces, transformation: Array, reach: float = TOUCHING) -> tuple[float, float]:
+    """The shares of the source's and of the target's points that lie on the other cloud, in [0, 1].
 
-    Attributes:
-        source_share: share of source points that lie on the target: near it, with like normals.
-        target_share: share of target points that lie on the source.
+    A point lies on the nearest one of the other cloud, within ``reach`` spacings, where their normals agree.
     """
-
-    source_share: float
-    target_share: float
-
-    @property
-    def score(self) -> float:
-        """The geometric mean, which is high only where both clouds are explained."""
-        return float(np.sqrt(self.source_share * self.target_share))
+    mine, _ = surfaces.alike(transformation, reach)
+    theirs, _ = surfaces.swapped().alike(rigid.inverse(transformation), reach)
+    return len(mine) / len(surfaces.source.points), len(theirs) / len(surfaces.target.points)
 
 
-def agreement(source: Refinable, target: Refinable, transformation: Points, distance: float) -> Agreement:
-    """Overlap of the clouds under a rigid transform (4, 4), at ``distance``; the same when the two are swapped."""
-    rotation, translation = transformation[:3, :3], transformation[:3, 3]
-    # each cloud is taken to the other, whose tree lies ready
-    moved, moved_back = source.points @ rotation.T + translation, (target.points - translation) @ rotation
-    return Agreement(
-        _share_on(moved, source.normals @ rotation.T, target, distance),
-        _share_on(moved_back, target.normals @ rotation, source, distance),
-    )
+def overlap(surfaces: Surfaces, transformation: Array, reach: float = TOUCHING) -> float:
+    """The geometric mean of both shares, which is high only where both clouds are explained."""
+    mine, theirs = shares(surfaces, transformation, reach)
+    return float((mine * theirs) ** 0.5)
 
 
-def touching(
-    source: Refinable, target: Refinable, transformation: Points, distance: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the source points that a transform (4, 4) lays on the target, and of the target points they lie on.
+def exactness(surfaces: Surfaces, transformation: Array, reach: float) -> tuple[float, float]:
+    """How exactly finer clouds lie on each other where coarser ones touch, under a transform (4, 4).
 
-    A point lies on the nearest one, within ``distance``, where their normals are alike.
+    What only seems to touch at a coarse resolution comes apart at a fine one.
+
+    Args:
+        surfaces: the finer clouds.
+        transformation: (4, 4), refined on them.
+        reach: distance within which the coarser clouds touch, in working units.
+
+    Returns:
+        The share of the points within reach that touch on the finer clouds too, in [0, 1]; and the median distance of
+        points within reach from the other cloud's tangent plane, as a share of the reach. 0 and 1 where nothing is
+        within reach.
     """
-    rotation = transformation[:3, :3]
-    moved = source.points @ rotation.T + transformation[:3, 3]
-    return _laid_on(moved, source.normals @ rotation.T, target, distance)
-
-
-def _share_on(points: Points, normals: Points, other: Refinable, distance: float) -> float:
-    return len(_laid_on(points, normals, other, distance)[0]) / len(points)
-
-
-def _laid_on(
-    points: Points, normals: Points, other: Refinable, distance: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    found, index = other.search.query(points, distance_upper_bound=distance)
-    near = np.flatnonzero(np.isfinite(found))
-    cosine = np.abs((normals[near] * other.normals[index[near]]).sum(1))
-    near = near[cosine >= SAME_SURFACE]
-    return near, index[near]
-
-
-def inliers(moved: Points, target: Points, distance: float) -> tuple[NDArray[np.int64], float]:
-    """Pairs (C, 2) of rows of the moved source and the target within ``distance``, and their RMSE (0 for no pairs)."""
-    # near points one after the other find their part of the tree in the cache: four times as fast on a million
-    order = np.argsort(voxels(moved - moved.mean(0), max(distance, LEAST_CELL)))
-    # a loose tree is quicker to build, and much quicker where neighbours are far
-    tree = cKDTree(target, compact_nodes=False)
-    found, index = np.empty(len(moved)), np.empty(len(moved), np.int64)
-    found[order], index[order] = tree.query(moved.take(order, axis=0), distance_upper_bound=distance, workers=-1)
-    rows = np.flatnonzero(np.isfinite(found))
-    rmse = float(np.sqrt(np.mean(found[rows] ** 2))) if len(rows) else 0.0
-    return np.stack([rows, index[rows]], 1), rmse
+    spacings = reach / surfaces.spacing
+    ways = (surfaces, transformation), (surfaces.swapped(), rigid.inverse(transformation))
+    within, off = [np.empty(0)], [np.empty(0)]
+    for pair, way in ways:
+        distance, mine, theirs = pair.touching(way, spacings)
+        gap = rigid.apply(way, pair.source.points[mine]) - pair.target.points[theirs]
+        within.append(distance)
+        off.append(np.abs((gap * pair.target.normals[theirs]).sum(1)))
+    distances = np.concatenate(within)
+    if len(distances) == 0:
+        return 0.0, 1.0
+    close = float((distances <= TOUCHING * surfaces.spacing).mean())
+    return close, min(1.0, float(np.median(np.concatenate(off))) / reach)

@@ -18,13 +18,12 @@ from idam.lab.data.general import (
     COUNTS,
     FEWEST,
     LEAST_OVERLAP,
-    TOUCHING,
     Material,
-    ScanPair,
     draw_scans,
     load_meshes,
 )
 from idam.lab.data.surfaces import random_blob
+from idam.lab.data.working import TOUCHING, ScanPair
 
 KINDS = ["_halves", "_views_of_a_thing", "_views_of_a_room", "_views_of_a_street"]
 kinds = pytest.mark.parametrize("kind", KINDS)
@@ -102,7 +101,7 @@ def test_scans_have_enough_points_and_their_spacing_is_the_wider_one_s(pairs):
     for pair in pairs:
         counts = len(pair.source), len(pair.target)
         assert FEWEST <= min(counts) <= max(counts) <= max(COUNTS)
-        assert pair.spacing == pytest.approx(max(spacing(pair.source), spacing(pair.target)))
+        assert pair.spacing == pytest.approx(max(spacing(pair.source), spacing(pair.target)), rel=1e-4)
     assert max(len(pair.target) for pair in pairs) > 1.5 * min(len(pair.target) for pair in pairs)
 
 
@@ -116,16 +115,17 @@ def test_too_few_points_are_drawn_again(material, monkeypatch):
 
 
 def test_what_overlaps_too_little_is_drawn_again(material, monkeypatch):
-    monkeypatch.setattr(general, "LEAST_OVERLAP", 0.8)
-    monkeypatch.setattr(general, "MORE_OVERLAP", 0.8)
-    assert all(draw_scans(material, np.random.default_rng(seed)).overlap >= 0.8 for seed in range(3))
+    monkeypatch.setattr(general, "LEAST_OVERLAP", 0.6)
+    monkeypatch.setattr(general, "MORE_OVERLAP", 0.6)
+    assert all(draw_scans(material, np.random.default_rng(seed)).overlap >= 0.6 for seed in range(5))
 
 
 def test_scans_are_in_working_coordinates(pairs):
     for pair in pairs:
         core = [np.quantile(np.linalg.norm(cloud, axis=1), 0.9) for cloud in (pair.source, pair.target)]
-        assert 0.5 < max(core) < 1.1
-        assert max(np.linalg.norm(np.median(cloud, 0)) for cloud in (pair.source, pair.target)) < 0.7
+        # the unit is the power of two nearest to the radius of most returns, and a LiDAR's farthest lie beyond
+        assert 0.4 < max(core) < 4
+        assert max(np.linalg.norm(np.median(cloud, 0)) for cloud in (pair.source, pair.target)) < 1
 
 
 def test_rotations_are_any(pairs):
@@ -187,7 +187,7 @@ def test_a_part_keeps_its_place_and_size_in_the_whole(spotless):
 @pytest.mark.parametrize(("name", "value"), [("NOISE", 0.0), ("STRAYS", 0.0), ("COUNTS", (300, 400, 500, 600))])
 def test_every_part_of_a_scan_s_fate_plays_its_part(name, value, material, pairs, monkeypatch):
     monkeypatch.setattr(general, name, value)
-    assert any(differ(pair, draw_scans(material, np.random.default_rng(n))) for n, pair in enumerate(pairs[:5]))
+    assert any(differ(pair, draw_scans(material, np.random.default_rng(n))) for n, pair in enumerate(pairs))
 
 
 @pytest.fixture

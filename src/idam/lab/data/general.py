@@ -1,9 +1,10 @@
 """Pairs of scans as practice has them: any rotation, other points, partial views, noise, strays; drawn without end.
 
 Where the paper's protocol crops two copies of the same points, here each scan samples the surface anew: a thing seen
-from a few viewpoints, a room, a street as a spinning LiDAR sees it, or half of a ModelNet40 shape's points. Both go
-through the same centring, scaling and voxel grid as in :func:`idam.register`, so that a network sees in training what
-it sees in use.
+from a few viewpoints, a room, a street as a spinning LiDAR sees it, or half of a ModelNet40 shape's points; and half of
+the pairs are ray-cast (:mod:`idam.lab.data.sensor_pairs`), with the sensors' own patterns in them. All go through the
+same centring, scaling and voxel grid as in :func:`idam.register`, so that a network sees in training what it sees in
+use.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from idam.clouds.frame import common_frame, without_strays
-from idam.clouds.pyramid import level
+from idam import rigid
 from idam.errors import InputError
 from idam.io.files import one_line, silenced
 from idam.lab.data.practice import make_practice_pairs
+from idam.lab.data.sensor_pairs import draw_part_in_whole, draw_sensor_pair
 from idam.lab.data.surfaces import random_room, random_street, random_thing
 from idam.lab.data.visibility import seen_from_afar, seen_from_within
+from idam.lab.data.working import ScanPair, as_registered
 
-__all__ = ["Material", "ScanPair", "draw_halves", "draw_scans", "load_meshes"]
+__all__ = ["Material", "draw_halves", "draw_scans", "load_meshes"]
 
 Points = NDArray[np.float64]
 Draw = Callable[["Material", np.random.Generator], "tuple[Points, Points] | None"]
@@ -45,10 +46,10 @@ STRAYS = 0.006
 """Largest share of points that are strays, in every third scan."""
 LEAST_OVERLAP, MORE_OVERLAP = 0.05, 0.2
 """A pair is drawn again where it overlaps less than a share drawn from between these."""
-TOUCHING = 1.2
-"""Spacings within which surfaces overlap."""
 RANGE = 2.2
 """How far a street's LiDAR sees."""
+SENSED, IN_WHOLE = 0.5, 0.2
+"""Share of pairs that are ray-cast as real sensors see, and of those, views of a part against the whole."""
 
 
 @dataclass(frozen=True)
@@ -57,25 +58,6 @@ class Material:
 
     shapes: NDArray[np.float32]
     meshes: Sequence[Any] = ()
-
-
-@dataclass(frozen=True)
-class ScanPair:
-    """Two scans in working coordinates, ready for features.
-
-    Attributes:
-        source: (N, 3).
-        target: (P, 3).
-        transformation: the truth (4, 4), source to target.
-        spacing: of their points.
-        overlap: share of the cloud that overlaps less.
-    """
-
-    source: Points
-    target: Points
-    transformation: Points
-    spacing: float
-    overlap: float
 
 
 def load_meshes(folder: Path) -> list[Any]:
@@ -105,14 +87,27 @@ def _load_mesh(path: Path) -> Any:
 
 def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
     """A pair of scans, a function of the generator's state."""
-    kinds: list[Draw] = [_halves, _views_of_a_thing, _views_of_a_room, _views_of_a_street]
     while True:
-        drawn = kinds[rng.choice(len(kinds), p=(0.2, 0.45, 0.2, 0.15))](material, rng)
-        if drawn is None:
-            continue
-        pair = _as_scanned(*drawn, rng)
+        pair = _as_sensed(material, rng) if rng.random() < SENSED else _of_dense_points(material, rng)
         if pair is not None and pair.overlap >= rng.uniform(LEAST_OVERLAP, MORE_OVERLAP):
             return pair
+
+
+def _as_sensed(material: Material, rng: np.random.Generator) -> ScanPair | None:
+    """A pair with the patterns of real sensors in it, turned in any way; None where too few points are left."""
+    inside = rng.random() < IN_WHOLE
+    pair = draw_part_in_whole(rng, material.meshes) if inside else draw_sensor_pair(rng)
+    turned = rigid.transform(Rotation.random(random_state=rng).as_matrix(), np.zeros(3))
+    return _in_working_coordinates(
+        pair.source, rigid.apply(turned, pair.target), turned @ pair.transformation, int(rng.choice(COUNTS, p=SHARES))
+    )
+
+
+def _of_dense_points(material: Material, rng: np.random.Generator) -> ScanPair | None:
+    """A pair that samples a surface of dense points evenly; None where there is too little of it."""
+    kinds: list[Draw] = [_halves, _views_of_a_thing, _views_of_a_room, _views_of_a_street]
+    drawn = kinds[rng.choice(len(kinds), p=(0.2, 0.45, 0.2, 0.15))](material, rng)
+    return None if drawn is None else _as_scanned(*drawn, rng)
 
 
 def draw_halves(material: Material, rng: np.random.Generator) -> ScanPair:
@@ -223,12 +218,5 @@ def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> Sca
 
 def _in_working_coordinates(source: Points, target: Points, truth: Points, count: int) -> ScanPair | None:
     """Clouds and the truth (4, 4) as :func:`idam.register` sees them; None where too few points are left."""
-    frame = common_frame(source, target)
-    scans = level(without_strays(frame.source(source)), without_strays(frame.target(target)), count)
-    if min(len(scans.source), len(scans.target)) < FEWEST:
-        return None
-    truth = frame.enter(truth)
-    reach = TOUCHING * scans.spacing
-    moved = scans.source @ truth[:3, :3].T + truth[:3, 3]
-    shares = [np.mean(cKDTree(a).query(b)[0] < reach) for a, b in ((scans.target, moved), (moved, scans.target))]
-    return ScanPair(scans.source, scans.target, truth, scans.spacing, float(min(shares)))
+    pair = as_registered(source, target, truth, count)
+    return pair if min(len(pair.source), len(pair.target)) >= FEWEST else None

@@ -13,7 +13,7 @@ from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.record import Missing
 from idam.lab.evaluation.runner import Row
 
-__all__ = ["Board", "columns", "results_table"]
+__all__ = ["Board", "columns", "results_table", "short_name"]
 
 WIDTH = 130
 """Columns of a table that is not printed to a terminal."""
@@ -47,15 +47,20 @@ def results_table(experiment: str, rows: list[Row | Missing]) -> Table:
     return table
 
 
+def short_name(method: str) -> str:
+    """A method of one's own by its function, the others as they are."""
+    return method.rpartition(":")[2]
+
+
 def _name(row: Row) -> str:
     settings = f" [{', '.join(row.task.settings)}]" if row.task.settings else ""
-    return row.task.method + (f" ({row.task.model})" if row.task.model else "") + settings
+    return short_name(row.task.method) + (f" ({row.task.model})" if row.task.model else "") + settings
 
 
 def _paper_columns(experiment: str) -> dict[str, Cell]:
     def beside(row: Row, place: int, text: str) -> str:
         # a method's other settings stand beside the same figures
-        name = row.task.method.removesuffix("-tuned").removesuffix("-paper")
+        name = short_name(row.task.method).removesuffix("-tuned").removesuffix("-paper")
         reported = PAPER.get(experiment, {}).get(name)
         return text if reported is None else f"{text} ({reported[place]:g})"
 
@@ -71,6 +76,7 @@ def _paper_columns(experiment: str) -> dict[str, Cell]:
 def _practice_columns() -> dict[str, Cell]:
     return {
         "recall": lambda row: f"{row.metrics.recall:.3f}",
+        "with symmetric poses": lambda row: "" if row.symmetric_recall is None else f"{row.symmetric_recall:.3f}",
         "without axisymmetric": lambda row: "" if row.observable is None else f"{row.observable.recall:.3f}",
         "angle": lambda row: f"{row.metrics.angle:.2f}",
         "distance": lambda row: f"{row.metrics.distance:.4f}",

@@ -11,7 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from idam.clouds.frame import check_points, common_frame
+from idam.clouds.frame import check_points
+from idam.clouds.prepared import Prepared
+from idam.clouds.pyramid import Pyramid
 from idam.errors import InputError
 from idam.io import read_point_cloud
 from idam.lab.data.pairs import Pairs
@@ -97,12 +99,12 @@ def _read_pair(source_path: Path, target_path: Path) -> Scan:
     source, target = read_point_cloud(source_path).points, read_point_cloud(target_path).points
     check_points(source, str(source_path))
     check_points(target, str(target_path))
-    frame = common_frame(source, target)
+    clouds = Pyramid(Prepared.of(source, "source"), Prepared.of(target, "target"))
     generator = torch.Generator().manual_seed(0)
     return (
         f"{source_path.stem}\nto {target_path.stem}",
-        _thin_out(frame.source(source), generator),
-        _thin_out(frame.target(target), generator),
+        _thin_out((source - clouds.source.centre) / clouds.unit, generator),
+        _thin_out((target - clouds.target.centre) / clouds.unit, generator),
     )
 
 

@@ -17,14 +17,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from idam import rigid
+from idam.describe.invariant import Surroundings, surroundings
 from idam.errors import InputError
-from idam.lab.data.general import Material, ScanPair, draw_halves, draw_scans, load_meshes
+from idam.lab.data.general import Material, draw_halves, draw_scans, load_meshes
 from idam.lab.data.modelnet40 import load
+from idam.lab.data.working import ScanPair
 from idam.lab.training.batches import VALIDATION_SEED, generator_at
 from idam.lab.training.checkpoint import initial_model
 from idam.lab.training.recipe import Recipe
 from idam.network.ablation import inner_products
-from idam.network.features.invariant import Invariant, Surroundings, surroundings
+from idam.network.features.invariant import Invariant
 from idam.network.model import IDAM
 from idam.network.supervision import negative_entropy_loss
 
@@ -122,7 +125,7 @@ class GeneralStep(nn.Module):
     def loss(self, pair: ScannedPair, generator: torch.Generator) -> MatchLoss:
         """The loss of one pair, of its rows and of its columns."""
         describe = cast(Invariant, self.model.features).describe
-        features = [describe(expanded(side)) for side in (pair.source, pair.target)]
+        features = [describe(side) for side in (pair.source, pair.target)]
         # the significance learns from features that learn to match, and leaves them alone
         significance = [self.model.significance(x.detach()[None])[0] for x in features]
         distance = torch.cdist(pair.aligned, pair.goal)
@@ -154,14 +157,9 @@ def matching_of(
     return MatchLoss(F.cross_entropy(score, match), entropy, right.float().mean())
 
 
-def expanded(around: Surroundings) -> Surroundings:
-    """Surroundings as the network takes them, from those that :class:`GeneralTask` keeps."""
-    return around._replace(histograms=around.histograms.float(), near=around.near.long())
-
-
 def compact(around: Surroundings) -> Surroundings:
     """Surroundings in half the memory: clouds have fewer points than 16 bits can count."""
-    return around._replace(histograms=around.histograms.half(), near=around.near.short())
+    return around._replace(histograms=around.histograms.astype(np.float16), near=around.near.astype(np.int16))
 
 
 class GeneralTask:
@@ -229,18 +227,17 @@ def check_general(recipe: Recipe, precision: str) -> None:
 
 
 def on_device(pair: ScannedPair, device: torch.device) -> ScannedPair:
-    """The pair, moved."""
-    source, target = (Surroundings(*(x.to(device) for x in side)) for side in (pair.source, pair.target))
-    return ScannedPair(source, target, pair.aligned.to(device), pair.goal.to(device))
+    """The pair, moved; surroundings follow the network by themselves."""
+    return pair._replace(aligned=pair.aligned.to(device), goal=pair.goal.to(device))
 
 
 def scanned(draw: Draw, material: Material, seed: int, index: int) -> ScannedPair:
     """A pair of scans that depends on the seed and its index alone."""
     pair = draw(material, np.random.default_rng((unsigned(seed), index)))
-    truth, clouds = pair.transformation, [torch.from_numpy(x).float() for x in (pair.source, pair.target)]
-    aligned = torch.from_numpy(pair.source @ truth[:3, :3].T + truth[:3, 3]).float()
-    source, target = (compact(surroundings(cloud, pair.spacing)) for cloud in clouds)
-    return ScannedPair(source, target, aligned / pair.spacing, clouds[1] / pair.spacing)
+    aligned = rigid.apply(pair.transformation, pair.source)
+    source, target = (compact(surroundings(cloud, pair.spacing)) for cloud in (pair.source, pair.target))
+    truth = (torch.from_numpy(points / pair.spacing).float() for points in (aligned, pair.target))
+    return ScannedPair(source, target, *truth)
 
 
 def unsigned(seed: int) -> int:

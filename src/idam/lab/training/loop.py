@@ -18,6 +18,7 @@ from idam.lab.training.log import Log, Parts
 from idam.lab.training.memory import keep_freed_memory
 from idam.lab.training.recipe import Recipe, check
 from idam.lab.training.task import PairTask, Task
+from idam.lab.training.underflow import flush_to_zero
 from idam.network.pretrained import save_model
 
 __all__ = ["train"]
@@ -72,6 +73,7 @@ def train(
     total = max(1, round(recipe.epochs * (task.size // recipe.batch_size)))
     module = task.module
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    flush_to_zero(optimizer)
     progress = restore(output / "last.ckpt", module.model, optimizer, asdict(recipe)) if resume else Progress()
     options = {name: value for name, value in asdict(recipe).items() if name != "config"}
     step_module, step_optimizer = fabric.setup(module, optimizer)

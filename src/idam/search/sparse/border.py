@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.align import Refinable, Surfaces
+from idam import rigid
+from idam.clouds.surfaces import Surface, Surfaces
+from idam.rigid import Array
 
 __all__ = ["mixing"]
-
-Points = NDArray[np.float64]
 
 ALONE = 2.0
 """Spacings to the nearest point of the other cloud from which on a point is one that the other does not show."""
@@ -27,28 +27,27 @@ SHARP = 3.0
 """By how much coordinates in working units are multiplied: about the slope that a border has."""
 
 
-def mixing(surfaces: Surfaces, transformation: Points) -> float:
+def mixing(surfaces: Surfaces, transformation: Array) -> float:
     """How far what only one cloud shows is mixed with the other cloud, under a transform (4, 4); 0 for not at all.
 
     For either cloud, a plane tells its points from those of the other that lie on none of them, as well as a plane can
     (a logistic regression); the sum of both cross-entropies, in nats a point, is the answer. Swapping changes nothing.
     """
     source, target = surfaces.source, surfaces.target
-    rotation, translation = transformation[:3, :3], transformation[:3, 3]
-    moved, back = source.points @ rotation.T + translation, (target.points - translation) @ rotation
+    moved, back = rigid.apply(transformation, source.points), rigid.apply(rigid.inverse(transformation), target.points)
     reach = ALONE * surfaces.spacing
     return _untold(target.points, moved[_alone(moved, target, reach)]) + _untold(
         source.points, back[_alone(back, source, reach)]
     )
 
 
-def _alone(points: Points, other: Refinable, reach: float) -> NDArray[np.bool_]:
+def _alone(points: Array, other: Surface, reach: float) -> NDArray[np.bool_]:
     """Which points (N, 3) have none of the other cloud's within reach."""
-    alone: NDArray[np.bool_] = np.isinf(other.search.query(points, distance_upper_bound=reach)[0])
+    alone: NDArray[np.bool_] = other.nearest(points)[0] > reach
     return alone
 
 
-def _untold(cloud: Points, others: Points) -> float:
+def _untold(cloud: Array, others: Array) -> float:
     """Cross-entropy per point of telling others (M, 3) from a cloud (N, 3) by a plane."""
     if len(others) == 0:
         return 0.0
@@ -65,5 +64,5 @@ def _untold(cloud: Points, others: Points) -> float:
     return float(-np.log(np.where(labels, chance, 1 - chance)).mean())
 
 
-def _logistic(x: Points) -> Points:
+def _logistic(x: Array) -> Array:
     return np.asarray(1 / (1 + np.exp(-x.clip(-7, 7))))

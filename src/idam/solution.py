@@ -1,0 +1,102 @@
+"""Two clouds to one transform: search, refine, and take the answer back to the input's coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from idam import rigid
+from idam.align import align, reaches
+from idam.align.information import information
+from idam.clouds.pyramid import Pyramid
+from idam.clouds.surfaces import TOUCHING
+from idam.models import Models
+from idam.result import Hypothesis, Matches
+from idam.rigid import Array
+from idam.search.judge import Evidence
+from idam.search.scope import Scope
+from idam.search.stages import search
+
+__all__ = ["Solution", "solve"]
+
+FEW_POINTS = 1024
+"""Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What two clouds come to, in input units.
+
+    Attributes:
+        answers: the transform to give, and the runners-up.
+        evidence: what speaks for the first.
+        matches: of features.
+        information: (6, 6), of T exp(x), rotation before translation.
+        distance: within which points count as inliers.
+        source_misses: the distance from each point of the thinned source, moved by the answer, to the target, (N,).
+        target_misses: likewise from the target to the source, (P,).
+    """
+
+    answers: list[Hypothesis]
+    evidence: Evidence
+    matches: Matches
+    information: Array
+    distance: float
+    source_misses: Array
+    target_misses: Array
+
+    @property
+    def fitness(self) -> float:
+        """Share of the source's points that are inliers."""
+        return float((self.source_misses <= self.distance).mean())
+
+    @property
+    def inlier_rmse(self) -> float:
+        """Root mean square distance of the inliers, 0 where there is none."""
+        inliers = self.source_misses[self.source_misses <= self.distance]
+        return float(np.sqrt(np.mean(inliers**2))) if len(inliers) else 0.0
+
+    def inverted(self) -> Solution:
+        """The same with source and target exchanged."""
+        answers = [replace(answer, transformation=rigid.inverse(answer.transformation)) for answer in self.answers]
+        return replace(
+            self,
+            answers=answers,
+            matches=Matches(self.matches.target, self.matches.source, self.matches.weight),
+            # (T exp(x))^-1 = T^-1 exp(-Ad x)
+            information=rigid.carried(self.information, rigid.adjoint(self.answers[0].transformation)),
+            source_misses=self.target_misses,
+            target_misses=self.source_misses,
+        )
+
+
+def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float, refine: str | None) -> Solution:
+    """Lay the source of a pyramid on its target.
+
+    Args:
+        clouds: both, at several resolutions.
+        models: the descriptor, and a network where one is named.
+        guess: (4, 4) in input units, or None.
+        max_angle: largest rotation in degrees, from the guess.
+        refine: method of fine alignment, or None.
+    """
+    method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
+    scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle)
+    found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
+    surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
+    best = align(surfaces, found.best, reaches(method)[1], method)
+    poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
+    return Solution(
+        answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],
+        evidence=found.evidence,
+        matches=Matches(
+            matches.source * unit + clouds.source.centre,
+            matches.target * unit + clouds.target.centre,
+            found.weights,
+        ),
+        information=clouds.information_left(information(surfaces, best)),
+        distance=TOUCHING * surfaces.spacing * unit,
+        source_misses=unit * surfaces.target.nearest(rigid.apply(best, surfaces.source.points))[0],
+        target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(best), surfaces.target.points))[0],
+    )
