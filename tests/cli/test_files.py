@@ -223,6 +223,6 @@ def test_short_help(call: Call, args: tuple[str, ...]) -> None:
     assert (code, err) == (0, "") and "Usage" in out
 
 
-def test_shell_completion(call: Call) -> None:
-    code, out, _ = call("--show-completion", "bash")
-    assert code == 0 and "_IDAM_COMPLETE" in out
+def test_shell_completion() -> None:
+    code, out, _ = launch("_IDAM_COMPLETE=complete_bash COMP_WORDS='idam app' COMP_CWORD=1 idam ")
+    assert (code, out.split()) == (0, ["apply"])

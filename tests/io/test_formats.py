@@ -238,7 +238,8 @@ def test_ply_moved_far_away_becomes_double(tmp_path: Path) -> None:
 
 
 def test_obj_moves_line_by_line(tmp_path: Path) -> None:
-    text = "mtllib a.mtl\nv 1 0 0 0.5 0.5 0.5\nv 0 1 0 1 0 0\nv 0 0 1 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\nf 1/1/1 2/1/1 3/1/1\n"
+    text = "mtllib a.mtl\nv 1 0 0 0.5 0.5 0.5\nv 0 1 0 1 0 0\nv 0 0 1 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\n"
+    text += "f 1/1/1 2/1/1 3/1/1\n"
     (tmp_path / "a.obj").write_text(text)
     move_file(tmp_path / "a.obj", MOTION, tmp_path / "b.obj")
     lines, before = (tmp_path / "b.obj").read_text().splitlines(), text.splitlines()

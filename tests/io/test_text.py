@@ -93,7 +93,7 @@ AMBIGUOUS = {
     "more fields than names": "x y z\n1.5 10.5 20.5 30.5\n2.5 11.5 21.5 31.5\n",
     "fewer fields than names": "id,x,y,z\n1.5,10.5,20.5\n2.5,11.5,21.5\n",
     "comment that names other columns": "# id x y z\n1.5 10.5 20.5 30.5 1\n2.5 11.5 21.5 31.5 1\n",
-    "numbered points without names": "1,5000.0,4000.0,100.0,TREE\n2,5001.0,4000.0,100.0,TREE\n3,5000.0,4003.0,100.0,MH\n",
+    "numbered points without names": "1,5000.0,4000.0,100.0,TREE\n2,5001.0,4000.0,100.0,TREE\n3,5000.0,4003.0,100,MH\n",
     "FARO without names": "0 0 1.5 2.5 3.5 10 20 30\n0 1 1.6 2.5 3.5 10 20 30\n1 0 1.7 2.6 3.5 11 21 31\n",
     "FARO column by column": "0 0 1.5 2.5 3.5\n1 0 1.6 2.5 3.5\n0 1 1.7 2.6 3.5\n",
     "two columns of one name": "x,y,z,x\n1,2,3,4\n",
