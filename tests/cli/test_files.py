@@ -224,5 +224,6 @@ def test_short_help(call: Call, args: tuple[str, ...]) -> None:
 
 
 def test_shell_completion() -> None:
-    code, out, _ = launch("_IDAM_COMPLETE=complete_bash COMP_WORDS='idam app' COMP_CWORD=1 idam ")
+    asked = {"_IDAM_COMPLETE": "complete_bash", "COMP_WORDS": "idam app", "COMP_CWORD": "1"}
+    code, out, _ = launch("idam ", env={**os.environ, **asked})
     assert (code, out.split()) == (0, ["apply"])
