@@ -17,6 +17,7 @@ from idam.rigid import Array
 from idam.search.judge import Evidence
 from idam.search.scope import Scope
 from idam.search.stages import search
+from idam.search.strength import Strength, strength
 
 __all__ = ["Solution", "solve"]
 
@@ -33,6 +34,7 @@ class Solution:
         evidence: what speaks for the first.
         matches: of features.
         information: (6, 6), of T exp(x), rotation before translation.
+        strength: what the data fix and what they leave free.
         distance: within which points count as inliers.
         source_misses: the distance from each point of the thinned source, moved by the answer, to the target, (N,).
         target_misses: likewise from the target to the source, (P,).
@@ -42,6 +44,7 @@ class Solution:
     evidence: Evidence
     matches: Matches
     information: Array
+    strength: Strength
     distance: float
     source_misses: Array
     target_misses: Array
@@ -60,12 +63,13 @@ class Solution:
     def inverted(self) -> Solution:
         """The same with source and target exchanged."""
         answers = [replace(answer, transformation=rigid.inverse(answer.transformation)) for answer in self.answers]
+        change = -rigid.adjoint(self.answers[0].transformation)  # (T exp(x))^-1 = T^-1 exp(-Ad x)
         return replace(
             self,
             answers=answers,
             matches=Matches(self.matches.target, self.matches.source, self.matches.weight),
-            # (T exp(x))^-1 = T^-1 exp(-Ad x)
-            information=rigid.carried(self.information, rigid.adjoint(self.answers[0].transformation)),
+            information=rigid.carried(self.information, change),
+            strength=self.strength.carried(change),
             source_misses=self.target_misses,
             target_misses=self.source_misses,
         )
@@ -96,6 +100,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
             found.weights,
         ),
         information=clouds.information_left(information(surfaces, best)),
+        strength=strength(surfaces, best).carried(clouds.to_input / unit),
         distance=TOUCHING * surfaces.spacing * unit,
         source_misses=unit * surfaces.target.nearest(rigid.apply(best, surfaces.source.points))[0],
         target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(best), surfaces.target.points))[0],
