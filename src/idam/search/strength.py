@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from idam import rigid
 from idam.clouds.surfaces import Surfaces
@@ -14,30 +13,20 @@ from idam.search.slides import slippage
 
 __all__ = ["Strength", "strength"]
 
-FREE = 0.005
-"""Share of a motion along the normals below which noise alone holds it: a plane's own with noise of a tenth of the
-spacing is 0.002, a corridor's along itself 0.002 to 0.03."""
-
 
 @dataclass(frozen=True, eq=False)
 class Strength:
     """How firmly the surfaces that lie on each other hold the transform T, along each of six motions T exp(s x).
 
     Attributes:
-        motions: (6, 6), twists x in the source's frame, rotation in radians before translation in input units, the least
-            firmly held first. Each moves the shared points by one input unit in the root mean square.
-        fixed: (6,), the share of each motion's mean square that goes along the normals, in [0, 1]: what little is left
-            of a slide along a wall, most of a push against it.
+        motions: (6, 6), twists x in the source's frame, rotation in radians before translation in input units, the
+            least firmly held first. Each moves the shared points by one input unit in the root mean square.
+        fixed: (6,), the share of each motion's mean square that goes along the normals, in [0, 1]: next to none of a
+            slide along a wall, most of a push against it. A corridor's scans have 0.002 to 0.03 along it, for noise.
     """
 
     motions: Array
     fixed: Array
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Which motions (6,) leave the shared surface on itself: the data do not fix them."""
-        free: NDArray[np.bool_] = self.fixed < FREE
-        return free
 
     def carried(self, change: Array) -> Strength:
         """With motions y = C x, ``change`` C (6, 6)."""
