@@ -20,6 +20,7 @@ from idam.describe.invariant import surroundings
 from idam.errors import InputError
 from idam.lab.data import general as scans
 from idam.lab.data.modelnet40 import Shapes
+from idam.lab.data.working import TOUCHING
 from idam.lab.training import Recipe, general, loop, train
 from idam.lab.training.batches import VALIDATION_SEED
 from idam.lab.training.general import (
@@ -205,7 +206,7 @@ def test_a_pair_s_clouds_overlap_under_the_truth(make, draw):
         pair = draw(material, np.random.default_rng((3, n)))
         found = scanned(draw, material, 3, n)
         distance = torch.cdist(found.aligned.double(), found.goal.double())
-        shares = [(distance.amin(way) < scans.TOUCHING).double().mean() for way in (0, 1)]
+        shares = [(distance.amin(way) < TOUCHING).double().mean() for way in (0, 1)]
         assert min(shares).item() == pytest.approx(pair.overlap, abs=1e-9)
         for side, cloud in ((found.source, found.aligned), (found.target, found.goal)):
             assert len(side.points) == len(cloud)
