@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from idam.clouds.prepared import Describes, Prepared
+from idam.clouds.prepared import Prepared
 from idam.clouds.pyramid import Pyramid
+from idam.describe.invariant import Descriptor, Surroundings
 from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence
 from idam.search.matching import FeatureMatches
 from idam.search.ranking import Answer, same
@@ -20,6 +21,7 @@ from idam.search.stages import (
     Found,
     Network,
     first_of_its_kind,
+    judged,
     least_turned,
     search,
 )
@@ -38,27 +40,27 @@ def pyramid(source: np.ndarray, target: np.ndarray) -> Pyramid:
     return Pyramid(Prepared.of(source, "source"), Prepared.of(target, "target"))
 
 
+class Speechless:
+    """Features of which all are alike."""
+
+    key = "speechless"
+
+    def describe(self, around: Surroundings) -> np.ndarray:
+        return np.zeros((len(around.points), 4), np.float32)
+
+
 def look(
     clouds: Pyramid,
     scope: Scope = ALL,
     method: str = "gicp",
     network: Network | None = None,
-    descriptor: Describes | None = None,
+    descriptor: Descriptor | Speechless | None = None,
 ) -> Found:
     return search(clouds, descriptor or load_descriptor(), network, scope, method)
 
 
 def not_asked(guess: np.ndarray) -> np.ndarray:
     pytest.fail("the network was asked")
-
-
-class Speechless:
-    """Features of which all are alike."""
-
-    key = "speechless"
-
-    def __call__(self, points: np.ndarray, spacing: float) -> np.ndarray:
-        return np.zeros((len(points), 4), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -274,13 +276,12 @@ def test_margin_is_how_much_less_the_next_best_scores_as_a_share(holding: Found)
     assert margin(Answer(FAR)) == margin(Answer(FAR), Answer(np.eye(4))) == 0.0
 
 
-def test_refined_moves_the_best_and_drops_those_that_end_where_it_does(holding: Found) -> None:
+def test_those_that_may_be_right_are_refined_and_those_that_end_alike_are_one(holding: Found) -> None:
     surfaces = holding.matching.clouds.surfaces
     near = rigid([0.03, 0.0, -0.02], [0.01, 0.0, 0.0]) @ TRUTH
     beside = TRUTH @ rigid([0.0, 0.2, 0.0], [0.02, 0.0, 0.0])
-    other = TRUTH @ about_z(120)
-    started = replace(holding, answers=[Answer(near, 0.5), Answer(beside, 0.4), Answer(other, 0.3)])
-    refined = started.refined(surfaces, "point")
-    np.testing.assert_allclose(refined.best, TRUTH, atol=1e-3)
-    np.testing.assert_array_equal([a.transformation for a in refined.answers[1:]], [other])
-    assert started.refined(surfaces, "none") is started
+    far = TRUTH @ about_z(120)
+    answers = [Answer(x, likelihood=y) for x, y in ((near, 0.5), (beside, 0.4), (far, 0.01))]
+    best, *others = judged(answers, holding.matching, "point", surfaces)
+    np.testing.assert_allclose(best.transformation, TRUTH, atol=1e-3)
+    np.testing.assert_array_equal([answer.transformation for answer in others], [far])
