@@ -8,6 +8,9 @@ import numpy as np
 
 from idam import rigid
 from idam.align.information import information
+from idam.align.patches import Dense
+from idam.align.polish import finished
+from idam.clouds.prepared import ALL
 from idam.clouds.pyramid import Pyramid
 from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
@@ -21,6 +24,10 @@ __all__ = ["Solution", "solve"]
 
 FEW_POINTS = 1024
 """Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
+
+
+DENSE = 500_000
+"""Points of each cloud that the last stage uses at most."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,8 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     found = found.refined(clouds.fine.surfaces, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
+    transformation, pairs = finished(surfaces, lambda: dense(clouds), found.best, method, last=refine == "gicp")
+    found = found.with_best(transformation)
     return Solution(
         answers=[Hypothesis(clouds.leave(answer.transformation), answer.score) for answer in found.answers],
         evidence=found.evidence,
@@ -93,8 +102,17 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
             matches.target * unit + clouds.target.centre,
             found.weights,
         ),
-        information=clouds.information_left(information(surfaces, found.best)),
+        information=clouds.information_left(information(pairs, surfaces.spacing)),
         distance=TOUCHING * surfaces.spacing * unit,
         source_misses=unit * surfaces.target.nearest(rigid.apply(found.best, surfaces.source.points))[0],
         target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(found.best), surfaces.target.points))[0],
     )
+
+
+def dense(clouds: Pyramid) -> tuple[Dense, Dense]:
+    """Both clouds in working units with all points, or every so manieth."""
+    level = clouds.fine
+    if level.source_level.voxel_size == ALL:
+        return Dense.of_surface(level.surfaces.source), Dense.of_surface(level.surfaces.target)
+    source, target = (Dense.of(cloud.every(DENSE) / clouds.unit) for cloud in (clouds.source, clouds.target))
+    return source, target

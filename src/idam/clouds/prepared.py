@@ -134,6 +134,14 @@ class Prepared:
             self.levels[voxel_size] = Level(self._thinned(voxel_size), voxel_size)
         return self.levels[voxel_size]
 
+    def every(self, most: int) -> Array:
+        """Points (N, 3) relative to the centre, in input units: every so manieth, so that ``most`` at most are left.
+
+        What a voxel grid does not do: leave the noise of the points as it is.
+        """
+        points = self._centred()
+        return np.ascontiguousarray(points[:: -(-len(points) // most)])
+
     def _thinned(self, voxel_size: float) -> Array:
         if voxel_size == ALL:  # a voxel grid merges copies of a point, too
             return np.unique(self._centred(), axis=0)

@@ -75,6 +75,11 @@ class Found:
         weight = self.matching.matches.weights(self.best)
         return weight / (weight.sum() or 1.0)
 
+    def with_best(self, transformation: Array) -> Found:
+        """With another transform (4, 4) for the best answer."""
+        first, *others = self.answers
+        return replace(self, answers=[replace(first, transformation=transformation), *others])
+
     def refined(self, fine: Surfaces, method: str) -> Found:
         """With the best answer refined on finer clouds, and without others that end where it does.
 
