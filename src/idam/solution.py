@@ -102,7 +102,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
             matches.target * unit + clouds.target.centre,
             found.weights,
         ),
-        information=clouds.information_left(information(pairs, surfaces.spacing)),
+        information=clouds.information_left(information(pairs)),
         distance=TOUCHING * surfaces.spacing * unit,
         source_misses=unit * surfaces.target.nearest(rigid.apply(found.best, surfaces.source.points))[0],
         target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(found.best), surfaces.target.points))[0],

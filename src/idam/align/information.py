@@ -8,15 +8,19 @@ from numpy.typing import NDArray
 from idam.align.patches import Pairs
 from idam.rigid import Array
 
-__all__ = ["information"]
+__all__ = ["inflation", "information"]
 
 FEWEST = 12
 """Pairs below which nothing can be told."""
-BLOCK = 8.0
-"""Side of the blocks within which residuals may be alike, in spacings."""
+BLOCK = 0.3
+"""Side of the blocks within which residuals may be alike, in working units (about the radius of the larger cloud).
+
+What a scanner bends goes over a good part of an object. Of 0.1, 0.2, 0.3, 0.4 and 0.5 the loops of three bunny scans
+have a mean squared error of 12.6, 6.0, 5.1, 3.9 and 3.2 by the covariances, where 6 is right. Synthetic scans, whose
+noise is independent, hardly tell them apart from 0.2 on (3.8 to 10.5 at 0.3)."""
 
 
-def information(pairs: Pairs, spacing: float) -> Array:
+def information(pairs: Pairs) -> Array:
     """The information matrix (6, 6) of a transform: the inverse of its covariance, in working units.
 
     Of T exp(x), rotation before translation. Residuals are not independent: neighbouring patches share points and
@@ -34,12 +38,25 @@ def information(pairs: Pairs, spacing: float) -> Array:
     weights = pairs.weights[:, None]
     gradient = pairs.gradients(pairs.normals)
     fixed = gradient.T @ (weights * gradient) * pairs.slope + 1e-9 * len(gradient) * np.eye(6)
-    scores = _sums(gradient * weights * pairs.residuals[:, None], _blocks(pairs.points, BLOCK * spacing))
-    variance = float(np.einsum("bi,ij,bj->", scores, np.linalg.inv(fixed), scores)) / 6
-    variance *= len(scores) / max(len(scores) - 6, 1)  # the six that were fitted leave the sums so much too small
+    variance = inflation(pairs, gradient, fixed)
     held = pairs.gradients(pairs.source_normals).T @ (weights * pairs.gradients(pairs.target_normals)) * pairs.slope
-    values, axes = np.linalg.eigh((held + held.T) / (2 * max(variance, 1e-18)))
+    values, axes = np.linalg.eigh((held + held.T) / (2 * variance))
     return np.asarray((axes * (values.clip(0) + 1)) @ axes.T)
+
+
+def inflation(pairs: Pairs, gradient: Array, fixed: Array) -> float:
+    """The variance of a residual as if they were independent: the scatter of sums over blocks, per unknown.
+
+    Args:
+        pairs: whose residuals they are.
+        gradient: of the residuals by the K unknowns, (C, K).
+        fixed: how fast the sum of what pulls falls with the unknowns, (K, K).
+    """
+    pull = _sums(gradient * (pairs.weights * pairs.residuals)[:, None], _blocks(pairs.points, BLOCK))
+    blocks, unknowns = pull.shape
+    scatter = float(np.einsum("bi,ij,bj->", pull, np.linalg.inv(fixed), pull)) / unknowns
+    # the unknowns that were fitted leave the sums so much too small
+    return max(scatter * blocks / max(blocks - unknowns, 1), 1e-18)
 
 
 def _blocks(points: Array, size: float) -> NDArray[np.int64]:
