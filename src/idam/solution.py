@@ -9,6 +9,9 @@ import numpy as np
 from idam import rigid
 from idam.align import align, reaches
 from idam.align.information import information
+from idam.align.patches import Dense
+from idam.align.polish import finished
+from idam.clouds.prepared import ALL
 from idam.clouds.pyramid import Pyramid
 from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
@@ -23,6 +26,10 @@ __all__ = ["Solution", "solve"]
 
 FEW_POINTS = 1024
 """Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
+
+
+DENSE = 500_000
+"""Points of each cloud that the last stage uses at most."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,8 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
-    best = align(surfaces, found.best, reaches(method)[1], method)
+    start = align(surfaces, found.best, reaches(method)[1], method)
+    best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last=refine == "gicp")
     poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
     return Solution(
         answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],
@@ -99,9 +107,18 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
             matches.target * unit + clouds.target.centre,
             found.weights,
         ),
-        information=clouds.information_left(information(surfaces, best)),
+        information=clouds.information_left(information(pairs)),
         strength=strength(surfaces, best).carried(clouds.to_input / unit),
         distance=TOUCHING * surfaces.spacing * unit,
         source_misses=unit * surfaces.target.nearest(rigid.apply(best, surfaces.source.points))[0],
         target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(best), surfaces.target.points))[0],
     )
+
+
+def dense(clouds: Pyramid) -> tuple[Dense, Dense]:
+    """Both clouds in working units with all points, or every n-th."""
+    level = clouds.fine
+    if level.source_level.voxel_size == ALL:
+        return Dense.of_surface(level.surfaces.source), Dense.of_surface(level.surfaces.target)
+    source, target = (Dense.of(cloud.every(DENSE) / clouds.unit) for cloud in (clouds.source, clouds.target))
+    return source, target

@@ -140,6 +140,14 @@ class Prepared:
             self.levels[voxel_size] = Level(thinned, voxel_size)
         return self.levels[voxel_size]
 
+    def every(self, most: int) -> Array:
+        """Points (N, 3) relative to the centre, in input units: every n-th, so that ``most`` at most are left.
+
+        What a voxel grid does not do: leave the noise of the points as it is.
+        """
+        points = self._centred()
+        return np.ascontiguousarray(points[:: -(-len(points) // most)])
+
     def _centred(self) -> Array:
         """The points (N, 3) relative to the centre, in input units, without strays."""
         return without_strays(self.points - self.centre, self.radius)
