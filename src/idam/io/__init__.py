@@ -7,7 +7,7 @@ file and says what to do. Every write is atomic: a failed one leaves the old fil
 from idam.io.cloud import Mesh, PointCloud, Scan
 from idam.io.convert import as_point_cloud
 from idam.io.files import check_destination, check_outputs, make_folder, write_json, write_text
-from idam.io.formats import check_writable, move_file, read_point_cloud, read_scans, write_point_cloud
+from idam.io.formats import check_writable, move_file, read_content, read_point_cloud, read_scans, write_point_cloud
 from idam.io.transforms import format_transform, read_transform, rigid_fault, write_transform
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "format_transform",
     "make_folder",
     "move_file",
+    "read_content",
     "read_point_cloud",
     "read_scans",
     "read_transform",

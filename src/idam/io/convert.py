@@ -158,7 +158,7 @@ def _from_open3d(data: Any) -> PointCloud | None:
         return _from_faces(data.vertices, np.asarray(data.triangles, np.int64).reshape(-1, 3))
     if hasattr(data, "points") and hasattr(data, "colors"):
         return _with_extras(data.points, data.colors, data.normals)
-    return None
+    return _from_array(np.asarray(data)) if hasattr(data, "__len__") else None  # cloud.points alone
 
 
 def _from_pyvista(data: Any) -> PointCloud:

@@ -30,7 +30,7 @@ from idam.io.files import (
     write_bytes,
 )
 
-__all__ = ["check_writable", "move_file", "read_point_cloud", "read_scans", "write_point_cloud"]
+__all__ = ["check_writable", "move_file", "read_content", "read_point_cloud", "read_scans", "write_point_cloud"]
 
 log = logging.getLogger("idam.io")
 
@@ -101,15 +101,10 @@ def read_point_cloud(path: StrPath) -> PointCloud:
         InputError: the file is missing, damaged, of an unknown format, or holds no points.
         MissingDependencyError: it needs a package that is not installed.
     """
-    content = _read(path)
+    content = read_content(path)
     if isinstance(content, Mesh):
-        try:
-            return mesh.sample_surface(content)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-    if isinstance(content, PointCloud):
-        return content
-    return joined([scan.placed() for scan in _scans(path, content)])
+        return _sampled(path, content)
+    return joined([scan.placed() for scan in content])
 
 
 def read_scans(path: StrPath) -> list[Scan]:
@@ -119,11 +114,21 @@ def read_scans(path: StrPath) -> list[Scan]:
         InputError: the file is missing, damaged, of an unknown format, or holds no points.
         MissingDependencyError: it needs a package that is not installed.
     """
+    content = read_content(path)
+    return [Scan(Path(path).name, _sampled(path, content))] if isinstance(content, Mesh) else content
+
+
+def read_content(path: StrPath) -> Mesh | list[Scan]:
+    """Read a file as it is: a mesh, or its scans.
+
+    Raises:
+        InputError: the file is missing, damaged, of an unknown format, or holds no points.
+        MissingDependencyError: it needs a package that is not installed.
+    """
     content = _read(path)
     if isinstance(content, list):
         return _scans(path, content)
-    cloud = mesh.sample_surface(content) if isinstance(content, Mesh) else content
-    return [Scan(Path(path).name, cloud)]
+    return content if isinstance(content, Mesh) else [Scan(Path(path).name, content)]
 
 
 def write_point_cloud(path: StrPath, cloud: Any) -> None:
@@ -218,6 +223,11 @@ def _read(path: StrPath) -> Content:
     return [content[number - 1]]
 
 
+def _sampled(path: StrPath, content: Mesh) -> PointCloud:
+    with _faults_of(path, _suffix(path)):
+        return mesh.sample_surface(content)
+
+
 def _scans(path: StrPath, content: list[Placed]) -> list[Scan]:
     name = Path(path).name
     if len(content) == 1:
@@ -234,7 +244,7 @@ def _write(path: StrPath, content: PointCloud | Mesh) -> None:
     suffix = _suffix(path)
     if isinstance(content, Mesh) and suffix not in _MESH_ENCODERS:
         log.warning("%s holds no faces: it gets %s points of the mesh's surface", path, f"{mesh.SAMPLES:,}")
-        content = mesh.sample_surface(content)
+        content = _sampled(path, content)
     elif isinstance(content, PointCloud) and suffix not in _ENCODERS:
         raise InputError(f"{path}: a {suffix} file holds a mesh, not points: write .ply instead")
     encode: Any = (_MESH_ENCODERS if isinstance(content, Mesh) else _ENCODERS)[suffix]
