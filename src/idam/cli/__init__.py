@@ -8,6 +8,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from idam import __version__
+from idam.cli.batch import batch
 from idam.cli.data import data
 from idam.cli.demo import demo
 from idam.cli.evaluate import evaluate
@@ -62,6 +63,6 @@ def about(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-for command in (register, demo, models, train, evaluate, figures):
+for command in (register, batch, demo, models, train, evaluate, figures):
     app.command()(command)
 app.add_typer(data, name="data")
