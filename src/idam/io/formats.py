@@ -14,7 +14,7 @@ from idam.io import arrays, las, mesh, pcd, ply, text
 from idam.io.cloud import PointCloud
 from idam.io.files import StrPath, check_destination, one_line, read_bytes, write_bytes
 
-__all__ = ["READABLE", "check_writable", "read_point_cloud", "write_point_cloud"]
+__all__ = ["check_writable", "read_point_cloud", "write_point_cloud"]
 
 _DECODERS: dict[str, Callable[[bytes], PointCloud]] = {
     ".ply": ply.decode,
@@ -27,8 +27,6 @@ _DECODERS: dict[str, Callable[[bytes], PointCloud]] = {
     **dict.fromkeys((".las", ".laz"), las.decode),
     **dict.fromkeys((".xyz", ".txt", ".asc", ".csv", ".pts"), text.decode),
 }
-READABLE = frozenset(_DECODERS)
-"""Extensions, in lower case, of files that :func:`read_point_cloud` reads."""
 _ENCODERS: dict[str, Callable[[PointCloud], bytes]] = {
     ".ply": lambda cloud: ply.encode(cloud, _coordinate_type(cloud)),
     ".pcd": lambda cloud: pcd.encode(cloud, _coordinate_type(cloud)),
