@@ -93,7 +93,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
         refine: method of fine alignment, or None.
     """
     method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
-    scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle)
+    scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle, given=guess is not None)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
     start = align(surfaces, found.best, reaches(method)[1], method)
