@@ -24,6 +24,7 @@ from idam.clouds.frame import common_frame, without_strays
 from idam.clouds.pyramid import level
 from idam.errors import InputError
 from idam.io.files import one_line, silenced
+from idam.lab.data.own_pairs import OwnPair
 from idam.lab.data.practice import make_practice_pairs
 from idam.lab.data.surfaces import random_room, random_street, random_thing
 from idam.lab.data.visibility import seen_from_afar, seen_from_within
@@ -47,16 +48,25 @@ LEAST_OVERLAP, MORE_OVERLAP = 0.05, 0.2
 """A pair is drawn again where it overlaps less than a share drawn from between these."""
 TOUCHING = 1.2
 """Spacings within which surfaces overlap."""
+OWN = 0.5
+"""Share of pairs that are one's own scans, where there are any: the rest keeps what other scenes have taught."""
 RANGE = 2.2
 """How far a street's LiDAR sees."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """What surfaces are made of, besides our own: ModelNet40 shapes (S, N, 3), and trimesh meshes."""
+    """What scans are made of, besides our own surfaces.
+
+    Attributes:
+        shapes: of ModelNet40, (S, N, 3).
+        meshes: of trimesh.
+        pairs: real scans with their true transforms.
+    """
 
     shapes: NDArray[np.float32]
     meshes: Sequence[Any] = ()
+    pairs: Sequence[OwnPair] = ()
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,10 @@ def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
     """A pair of scans, a function of the generator's state."""
     kinds: list[Draw] = [_halves, _views_of_a_thing, _views_of_a_room, _views_of_a_street]
     while True:
+        if material.pairs and rng.random() < OWN:
+            if (own := _own_scans(material, rng)) is not None:
+                return own
+            continue
         drawn = kinds[rng.choice(len(kinds), p=(0.2, 0.45, 0.2, 0.15))](material, rng)
         if drawn is None:
             continue
@@ -127,6 +141,15 @@ def draw_halves(material: Material, rng: np.random.Generator) -> ScanPair:
     )
     assert scans is not None  # no voxel grid leaves fewer of so few points
     return scans
+
+
+def _own_scans(material: Material, rng: np.random.Generator) -> ScanPair | None:
+    """A pair of real scans in another pose, at some resolution; None where too few points are left."""
+    pair = material.pairs[rng.integers(len(material.pairs))].located(always=True)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    count = int(rng.choice(COUNTS, p=SHARES))
+    return _in_working_coordinates(pair.source @ turn[:3, :3].T, pair.target, pair.transformation @ turn.T, count)
 
 
 def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
