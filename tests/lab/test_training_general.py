@@ -36,6 +36,7 @@ from idam.lab.training.general import (
     matching_of,
     scanned,
 )
+from idam.lab.training.recipe import check
 from idam.network.config import Config
 from idam.network.features.invariant import Invariant
 from idam.network.pretrained import load_model
@@ -106,6 +107,24 @@ def same(one: ScannedPair, other: ScannedPair) -> bool:
 def numbers(lesson: Lesson, task: GeneralTask) -> list[int]:
     """Which of the six pairs a lesson has."""
     return [next(n for n in range(6) if same(task.pair(n), pair)) for pair in lesson.pairs]
+
+
+def test_one_s_own_pairs_are_learnt_from_and_held_out(make, tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    scans_of, count = rng.standard_normal((9, 40, 3)), 9
+    arrays = {"source": scans_of, "target": scans_of, "R": np.tile(np.eye(3), (count, 1, 1)), "t": np.zeros((count, 3))}
+    np.savez(tmp_path / "mine.npz", **arrays)
+    kept = []
+    monkeypatch.setattr(general, "scanned", lambda draw, material, *_: kept.append(material))
+    task = make(pairs=str(tmp_path / "mine.npz"))
+    assert len(task.material.pairs) == 7
+    assert [len(material.pairs) for material in kept] == [2, 2]
+    assert "9 pairs of" in task.data
+
+
+def test_own_pairs_are_for_general_training_alone():
+    with pytest.raises(InputError, match="--pairs are for general training"):
+        check(Recipe(pairs="mine.npz"))
 
 
 # the loss
