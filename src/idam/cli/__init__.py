@@ -10,6 +10,7 @@ import typer
 
 from idam import __version__
 from idam.cli.apply import apply
+from idam.cli.batch import batch
 from idam.cli.data import data
 from idam.cli.demo import demo
 from idam.cli.evaluate import evaluate
@@ -76,6 +77,6 @@ def about(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-for command in (register, apply, info, demo, models, train, evaluate, figures):
+for command in (register, batch, apply, info, demo, models, train, evaluate, figures):
     app.command()(command)
 app.add_typer(data, name="data")
