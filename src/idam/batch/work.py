@@ -17,8 +17,8 @@ __all__ = ["Register", "Work"]
 Work = Callable[[Pair], Row]
 """What makes the row of a pair; raises nothing."""
 
-KEPT = 2 * BLOCK
-"""Scans to keep: those of a block of pairs (:func:`idam.batch.pairs.by_scan`)."""
+KEPT = 3 * BLOCK
+"""Scans to keep: the sources of a block of pairs, its targets, and those of the block before, which were used last."""
 
 
 class Register:
