@@ -1,4 +1,4 @@
-"""Work that costs nothing, for tests of what surrounds it; as a script, a batch of it to kill and start again.
+"""Work that costs nothing, for tests of what surrounds it; :func:`main` is a batch of it to kill and start again.
 
 What a pair does is in the name of its source: ``die`` kills the process, ``once`` does the first time, ``hang`` never
 ends, ``slow`` takes a while.
@@ -12,9 +12,9 @@ import os
 import signal
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
-from idam.batch import local
 from idam.batch.ledger import Ledger
 from idam.batch.pairs import Pair, by_scan, read_pairs
 from idam.batch.rows import COLUMNS, Row, failed_row
@@ -58,11 +58,9 @@ def main() -> None:
     parser.add_argument("folder")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--shard", type=int, nargs=2, default=(1, 1))
+    parser.add_argument("--engine", choices=("local", "distributed"), default="local")
     args = parser.parse_args()
+    engine = import_module(f"idam.batch.{args.engine}")
     with Ledger(args.folder, {"work": "cheap"}, read_pairs(args.pairs), tuple(args.shard)) as ledger:
-        for row in local.run(by_scan(ledger.todo()), Cheap, args.jobs):
+        for row in engine.run(by_scan(ledger.todo()), Cheap, args.jobs):
             ledger.append(row)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

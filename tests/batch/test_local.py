@@ -9,20 +9,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from multiprocessing import active_children
 from pathlib import Path
 
-import cheap
 import pytest
 from cheap import ENVIRONMENT, Cheap, settled
+from processes import alive, count, descendants, processes, start, until
 
 from idam.batch import local
 from idam.batch.ledger import read_run
 from idam.batch.pairs import Pair, as_pairs, by_scan
 from idam.batch.rows import Row
-
-processes = pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to see the processes of a batch")
 
 
 def pairs_in(folder: Path, names: list[str]) -> list[Pair]:
@@ -104,48 +101,6 @@ def test_a_script_without_guard_is_told(tmp_path: Path) -> None:
     assert done.returncode
     assert done.stderr.splitlines()[-1].startswith("idam.errors.InputError: worker processes die before they begin")
     assert "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
-
-
-def descendants(process: int) -> list[int]:
-    """All processes below one."""
-    found = []
-    for task in Path(f"/proc/{process}/task").glob("*/children"):
-        try:
-            children = [int(child) for child in task.read_text().split()]
-        except OSError:
-            continue
-        found += [*children, *(below for child in children for below in descendants(child))]
-    return found
-
-
-def alive(ids: list[int]) -> list[int]:
-    """Those of some processes that still run."""
-
-    def state(process: int) -> str:
-        try:
-            return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return "X"
-
-    return [process for process in ids if state(process) not in "XZ"]
-
-
-def until(condition: Callable[[], bool], seconds: float = 30.0) -> bool:
-    """Whether something comes true in time."""
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
-    return condition()
-
-
-def start(pairs: Path, folder: Path, *args: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, cheap.__file__, str(pairs), str(folder), *args]
-    with folder.with_suffix(".log").open("a") as log:
-        return subprocess.Popen(command, env=ENVIRONMENT, stderr=log, start_new_session=True)
-
-
-def count(folder: Path) -> int:
-    return sum(len(file.read_bytes().splitlines()) for file in folder.glob("rows/*.jsonl"))
 
 
 @pytest.fixture

@@ -53,6 +53,7 @@ def run(
     try:
         if own:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+        logging.getLogger("ray.data").setLevel(logging.ERROR)
         ray.data.DataContext.get_current().enable_progress_bars = False
         blocks = -(-len(pairs) // BLOCK)
         actors = min(jobs or int(ray.cluster_resources().get("CPU", 1)), blocks)

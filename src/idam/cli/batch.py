@@ -67,17 +67,19 @@ def batch(
     if collect is not None:
         gather(collect, output)
         return
+    if not time_limit > 0:
+        raise InputError(f"the time limit must be more than 0 s, not {time_limit:g}")
     from idam.batch.ledger import Ledger
     from idam.batch.options import check_options, job_of, parse_options
     from idam.batch.pairs import by_scan, read_pairs
     from idam.batch.within import pairs_within
     from idam.batch.work import Register
 
-    run = engine_of(engine, address)
+    run, part = engine_of(engine, address), parse_shard(shard)
     options = parse_options(settings or ())
     check_options(options)
     work = pairs_within(within, partners) if within is not None else read_pairs(str(pairs))
-    with Ledger(output, job_of(options), work, parse_shard(shard)) as ledger:
+    with Ledger(output, job_of(options), work, part) as ledger:
         todo = by_scan(ledger.todo(retry_failed))
         try:
             follow(ledger, run(todo, partial(Register, options), jobs, time_limit), len(todo))
