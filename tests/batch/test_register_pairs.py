@@ -119,7 +119,7 @@ def test_whatever_register_raises_is_a_row(folder: Path, monkeypatch: pytest.Mon
 def test_a_scan_is_read_once_for_pairs_that_follow_one_another(
     folder: Path, monkeypatch: pytest.MonkeyPatch, counting: Callable[[str], list[Any]]
 ) -> None:
-    read = counting("idam.batch.work._ready")
+    read = counting("idam.registration.prepare")
     monkeypatch.setattr("idam.registration.register", lambda *args, **options: 1 / 0)
     work = Register({})
     star = [(folder / "0.npy", folder / f"{i % 3}.npy") for i in range(9)]
@@ -127,7 +127,8 @@ def test_a_scan_is_read_once_for_pairs_that_follow_one_another(
     for pair in by_scan(pairs):
         work(pair)
     assert len(read) == 3
-    many = as_pairs([(np.zeros((5, 3)), np.zeros((5, 3))) for _ in range(KEPT)])
+    cloud = np.load(folder / "0.npy")
+    many = as_pairs([(cloud.copy(), cloud.copy()) for _ in range(KEPT)])
     for pair in by_scan(many):
         work(pair)
     assert len(work._scans) == KEPT
@@ -142,9 +143,9 @@ def counting(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], list[Any]]:
         calls: list[Any] = []
         original = getattr(__import__(module, fromlist=[function]), function)
 
-        def counted(*args: Any) -> Any:
+        def counted(*args: Any, **options: Any) -> Any:
             calls.append(args)
-            return original(*args)
+            return original(*args, **options)
 
         monkeypatch.setattr(name, counted)
         return calls

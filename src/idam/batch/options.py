@@ -6,11 +6,11 @@ import hashlib
 import inspect
 import types
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from idam import __version__
 from idam.errors import InputError
+from idam.weights import find
 
 __all__ = ["check_options", "job_of", "parse_options"]
 
@@ -54,6 +54,7 @@ def check_options(options: Mapping[str, Any]) -> None:
         InputError: one is unknown or out of range, or there is no such model.
     """
     from idam import registration
+    from idam.models import resolve
 
     values = {**_defaults(), **options}
     unknown = [name for name in values if name not in _defaults()]
@@ -61,7 +62,7 @@ def check_options(options: Mapping[str, Any]) -> None:
         raise InputError(f"unknown option {unknown[0]!r}: the ones for all pairs are {', '.join(_defaults())}")
     names = ("max_angle", "voxel_size", "max_correspondence_distance", "refine", "seed")
     registration.check_options(*(values[name] for name in names))
-    _weights(values["model"])
+    resolve(values["model"], values["device"])
 
 
 def _defaults() -> dict[str, Any]:
@@ -75,10 +76,5 @@ def _defaults() -> dict[str, Any]:
 def job_of(options: Mapping[str, Any]) -> dict[str, Any]:
     """What rows depend on beside the pairs: idam's version, every option, and the weights themselves."""
     values = {**_defaults(), **options}
-    return {"idam": __version__, "weights": hashlib.sha256(_weights(values["model"])).hexdigest(), **values}
-
-
-def _weights(model: str) -> bytes:
-    from idam.network.pretrained import find
-
-    return Path(find(model)).read_bytes()
+    weights = b"".join(find(part).read_bytes() for part in values["model"].split("+"))
+    return {"idam": __version__, "weights": hashlib.sha256(weights).hexdigest(), **values}

@@ -25,8 +25,8 @@ COLUMNS = ("id", "source", "target", "init", "max_angle", "voxel_size")
 """What a pair may say about itself."""
 
 BLOCK = 10
-"""Scans to a side of a block of pairs. A process that keeps three times as many reads, for all pairs of n scans, n^2 / 20
-times; with the pairs in the order of a list, n^2 / 2 times."""
+"""Scans to a side of a block of pairs. All pairs of n scans then cost a process that keeps three times as many n^2 / 20
+readings; in the order of a list, they cost n^2 / 2."""
 
 
 @dataclass(frozen=True, eq=False)

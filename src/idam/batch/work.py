@@ -10,7 +10,7 @@ from typing import Any
 from idam.batch.pairs import BLOCK, Pair
 from idam.batch.rows import Row, failed_row, ok_row
 from idam.errors import InputError, MissingDependencyError
-from idam.io import as_point_cloud, read_transform
+from idam.io import read_transform
 
 __all__ = ["Register", "Work"]
 
@@ -50,18 +50,15 @@ class Register:
         return ok_row(pair, result, time.perf_counter() - started)
 
     def _scan(self, number: int, cloud: Any) -> Any:
-        """A scan made ready to register, kept until others were asked for more lately."""
+        """A scan prepared to be registered, kept until others were asked for more lately."""
+        from idam.registration import prepare
+
         if number not in self._scans:
-            self._scans[number] = _ready(cloud)
+            self._scans[number] = prepare(cloud, model=self._options.get("model", "default"))
         self._scans.move_to_end(number)
         while len(self._scans) > KEPT:
             self._scans.popitem(last=False)
         return self._scans[number]
-
-
-def _ready(cloud: Any) -> Any:
-    """All of the work on a pair that depends on one cloud alone."""
-    return as_point_cloud(cloud)
 
 
 def _own_options(pair: Pair) -> dict[str, Any]:
