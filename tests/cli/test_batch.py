@@ -184,16 +184,6 @@ def test_the_folder_of_another_job_is_refused(scans: Path, call: Call) -> None:
     )
 
 
-def test_too_many_scans_for_all_pairs(scans: Path, call: Call) -> None:
-    for number in range(40):
-        (scans / f"scans/more{number}.ply").touch()
-    refused = call("batch", "--within", "scans", "-o", "run")
-    assert (refused.code, refused.err) == (
-        2,
-        "idam: 44 scans: past 30 give the number of partners of each, such as --partners 8\n",
-    )
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a group of processes there")
 def test_interrupted_it_says_how_to_go_on(scans: Path) -> None:
     lines = [f'{{"id": {i}, "source": "scans/0.npy", "target": "scans/1.npy"}}\n' for i in range(1000)]

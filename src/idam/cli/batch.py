@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from idam.cli.shared import UNSURE
+from idam.cli.shared import UNSURE, tell
 from idam.errors import InputError
 
 if TYPE_CHECKING:
     from idam.batch.ledger import Ledger
+    from idam.batch.pairs import Pair
     from idam.batch.rows import Row
 
 __all__ = ["batch"]
@@ -32,7 +33,8 @@ def batch(
     ] = None,
     within: Annotated[Path | None, typer.Option(help="Pair the scans in this folder with one another.")] = None,
     partners: Annotated[
-        int | None, typer.Option(min=1, help="For each scan so many, the likeliest; all if left out, up to 30 scans.")
+        int | None,
+        typer.Option(min=1, help="For each scan so many, the likeliest; for up to 30 scans all if left out."),
     ] = None,
     collect: Annotated[
         Path | None, typer.Option(help="Write the rows of this run as one table: .csv, .jsonl or .parquet.")
@@ -72,13 +74,12 @@ def batch(
     from idam.batch.ledger import Ledger
     from idam.batch.options import check_options, job_of, parse_options
     from idam.batch.pairs import by_scan, read_pairs
-    from idam.batch.within import pairs_within
     from idam.batch.work import Register
 
     run, part = engine_of(engine, address), parse_shard(shard)
     options = parse_options(settings or ())
     check_options(options)
-    work = pairs_within(within, partners) if within is not None else read_pairs(str(pairs))
+    work = read_pairs(str(pairs)) if within is None else chosen(within, partners)
     with Ledger(output, job_of(options), work, part) as ledger:
         todo = by_scan(ledger.todo(retry_failed))
         try:
@@ -102,6 +103,14 @@ def gather(run: Path, table: Path) -> None:
     if missing:
         print(f"idam: {missing} pairs have no row yet: run the same command to go on", file=sys.stderr)
         raise typer.Exit(UNSURE)
+
+
+def chosen(folder: Path, partners: int | None) -> list[Pair]:
+    """The pairs of a folder's scans."""
+    from idam.batch.within import pairs_within
+
+    tell("choosing pairs")
+    return pairs_within(folder, partners)
 
 
 def engine_of(name: str, address: str | None) -> Callable[..., Iterator[Row]]:
