@@ -20,7 +20,8 @@ from idam.batch.pairs import Pair, by_scan, read_pairs
 from idam.batch.rows import COLUMNS, Row, failed_row
 
 ENVIRONMENT = os.environ | {
-    "PYTHONPATH": os.pathsep.join([*map(os.path.abspath, sys.path), str(Path(__file__).parent)])
+    "PYTHONPATH": os.pathsep.join([*map(os.path.abspath, sys.path), str(Path(__file__).parent)]),
+    "RAY_worker_niceness": "0",  # else a busy machine leaves them no time
 }
 """For processes of tests, which import this."""
 

@@ -32,6 +32,7 @@ def test_goes_on_where_it_was(tmp_path: Path, pairs: list[Pair]) -> None:
         assert ledger.todo() == pairs
         for pair in pairs[:3]:
             ledger.append(Cheap()(pair))
+        ledger.append(Cheap()(pairs[0]))  # made twice
         ledger.append(failed_row(pairs[3], "x.ply: is\nempty", 0.5))
         assert ledger.todo() == pairs[4:]
     with Ledger(tmp_path, JOB, pairs) as ledger:
@@ -39,6 +40,7 @@ def test_goes_on_where_it_was(tmp_path: Path, pairs: list[Pair]) -> None:
         assert ledger.todo(retry_failed=True) == pairs[3:]
         ledger.append(Cheap()(pairs[3]))
         assert ledger.todo(retry_failed=True) == pairs[4:]
+    assert len(rows_of(tmp_path).read_text().splitlines()) == 5
     rows, missing = read_run(tmp_path)
     assert [row["id"] for row in rows] == [pair.id for pair in pairs[:4]]
     assert {row["status"] for row in rows} == {"ok"}

@@ -132,6 +132,9 @@ def test_a_scan_is_read_once_for_pairs_that_follow_one_another(
     for pair in by_scan(many):
         work(pair)
     assert len(work._scans) == KEPT
+    monkeypatch.setattr("idam.batch.work.KEPT_POINTS", 5 * len(cloud))
+    work(by_scan(many)[0])
+    assert len(work._scans) == 5
 
 
 @pytest.fixture

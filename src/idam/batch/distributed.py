@@ -52,7 +52,7 @@ def run(
     own = not ray.is_initialized()
     try:
         if own:
-            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+            ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
         logging.getLogger("ray.data").setLevel(logging.ERROR)
         ray.data.DataContext.get_current().enable_progress_bars = False
         blocks = -(-len(pairs) // BLOCK)

@@ -56,11 +56,13 @@ class Ledger:
         return [pair for pair in self.pairs if self.status.get(pair.id) not in done]
 
     def append(self, row: Row) -> None:
-        """Add a row; it is on the disk when this returns.
+        """Add a row, unless the pair has a good one; it is on the disk when this returns.
 
         Raises:
             InputError: the disk is full, or the folder gone.
         """
+        if self.status.get(row["id"]) == "ok":
+            return  # an engine that tries a group of pairs again may make some rows twice
         line = (json.dumps(row, allow_nan=False) + "\n").encode()
         size = os.fstat(self._file).st_size
         try:
