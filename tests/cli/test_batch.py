@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -182,6 +183,21 @@ def test_the_folder_of_another_job_is_refused(scans: Path, call: Call) -> None:
     assert refused == Run(
         2, "", "idam: run: holds another job (max_angle 180.0, not 90.0): choose another folder, or do the same job\n"
     )
+
+
+def test_the_page_about_many_pairs_runs(scans: Path, call: Call) -> None:
+    for number in range(3):
+        write_point_cloud(scans / f"scans/{number}.ply", np.load(scans / f"scans/{number}.npy"))
+    (scans / "scans/broken.ply").unlink()
+    text = (Path(__file__).resolve().parents[2] / "docs/many-pairs.md").read_text(encoding="utf-8")
+    python = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    exec(python[0], names)
+    for command in ("idam batch pairs.csv -o run/", "idam batch --collect run/ -o results.csv"):
+        assert f"\n{command}\n" in text
+        assert call(*command.split()[1:]).code == 0
+    exec(python[1] + "assert len(good) == 3\n", names)
+    exec(python[2] + '    assert row["status"] == "ok"\n', names)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a group of processes there")
