@@ -31,7 +31,6 @@ import numpy as np
 import idam
 from idam import rigid
 from idam.batch.ledger import read_run
-from idam.lab.evaluation.record import processor
 
 Record = dict[str, Any]
 
@@ -199,6 +198,8 @@ def main() -> None:
     parser.add_argument("--memory-pairs", type=int, default=10_000)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    from idam.lab.evaluation.record import processor  # PyTorch with it, which workers that import this do not need
+
     results: Record = {
         "command": shlex.join(["python", *sys.argv]),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
