@@ -139,7 +139,7 @@ def engines(pairs: Path, folder: Path, calm: dict[str, Record]) -> Record:
     return found
 
 
-def speed(pairs: Path, folder: Path, repeats: int = 3) -> Record:
+def speed(pairs: Path, folder: Path, repeats: int) -> Record:
     """Pairs a second and processor time of each, starting included; each way once a round, in turn."""
     names = [line.split() for line in pairs.read_text().splitlines()]
     ways: dict[str, tuple[str, ...]] = {"1 process": ("--jobs", "1"), "2 processes": ("--jobs", "2")}
@@ -195,6 +195,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=1000)
     parser.add_argument("--points", type=int, default=200)
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--memory-pairs", type=int, default=10_000)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
@@ -216,7 +217,7 @@ def main() -> None:
         if "engines" in arguments.parts:
             results["engines"] = engines(pairs, folder, calm)
         if "speed" in arguments.parts:
-            results["speed"] = speed(pairs, folder)
+            results["speed"] = speed(pairs, folder, arguments.repeats)
         if "memory" in arguments.parts:
             results["memory"] = memory(pairs, arguments.memory_pairs)
     text = json.dumps(results, indent=1)
