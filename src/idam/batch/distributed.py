@@ -34,7 +34,7 @@ def run(
     Args:
         pairs: ordered by scan, with paths that every machine can read.
         build: makes the work, in each process.
-        jobs: actors, of one core each; None for as many as the cluster has cores.
+        jobs: actors, of one core each; None for as many as the cluster has or gets cores for.
         limit: seconds that a pair may take.
         address: of the cluster; ``auto`` for the one this machine is in, None to start one here.
 
@@ -50,13 +50,15 @@ def run(
     if not pairs:
         return
     own = not ray.is_initialized()
-    try:
-        if own:
+    if own:
+        try:
             ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        except Exception as error:  # Ray raises bare ones, too
+            raise InputError(f"Ray cannot be reached or started ({one_line(error)}): check its address") from error
+    try:
         logging.getLogger("ray.data").setLevel(logging.ERROR)
         ray.data.DataContext.get_current().enable_progress_bars = False
         blocks = -(-len(pairs) // BLOCK)
-        actors = min(jobs or int(ray.cluster_resources().get("CPU", 1)), blocks)
         rows = ray.data.from_items(
             [{"pair": pickle.dumps(pair)} for pair in pairs], override_num_blocks=blocks
         ).map_batches(
@@ -64,11 +66,11 @@ def run(
             fn_constructor_kwargs={"build": build, "limit": limit},
             batch_size=None,
             num_cpus=1,
-            compute=ray.data.ActorPoolStrategy(min_size=1, max_size=actors),
+            compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(jobs or blocks, blocks)),
         )
         for batch in rows.iter_batches(batch_size=None):
             yield from map(json.loads, batch["row"])
-    except (ray.exceptions.RayError, ConnectionError, ValueError) as error:
+    except ray.exceptions.RayError as error:
         raise InputError(f"Ray: {one_line(error)}: check the cluster, and run the same command to go on") from error
     finally:
         if own:
