@@ -145,7 +145,7 @@ def draw_halves(material: Material, rng: np.random.Generator) -> ScanPair:
 
 def _own_scans(material: Material, rng: np.random.Generator) -> ScanPair | None:
     """A pair of real scans in another pose, at some resolution; None where too few points are left."""
-    pair = material.pairs[rng.integers(len(material.pairs))].located(always=True)
+    pair = material.pairs[int(rng.integers(len(material.pairs)))].located(always=True)
     turn = np.eye(4)
     turn[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     count = int(rng.choice(COUNTS, p=SHARES))
