@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +107,7 @@ def cast(solids: Sequence[Solid], ground: Ground | None, origin: Array, directio
         away, radius = float(np.linalg.norm(towards)), float(np.linalg.norm(solid.half))
         if away - radius > reach:
             continue
-        rows = slice(None)
+        rows: Any = slice(None)
         if away > radius:  # only rays in the cone about the solid's sphere
             rows = np.flatnonzero(towards @ rays > np.sqrt(away**2 - radius**2))
         enter, leave = _interval(solid, origin, rays[:, rows])

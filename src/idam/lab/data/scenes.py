@@ -308,7 +308,7 @@ def tunnel(rng: np.random.Generator) -> Scene:
             scene.add("box", (x, 0, radius - floor - out / 2), (1.0, 0.5, out))
         along, turn = repeat(period), about(UP, (period * shift, 0, 0))
     edge = np.sqrt(radius**2 - floor**2)
-    turns = (turn,)
+    turns: tuple[Symmetry, ...] = (turn,)
     if rng.random() < 0.5:  # a pavement on one side
         scene.add("box", (0, edge - 0.4, 0.1), (2 * scene.length, 0.8, 0.3))
         turns = ()

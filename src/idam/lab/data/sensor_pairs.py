@@ -190,7 +190,7 @@ def _draw_part(rng: np.random.Generator, family: str, meshes: Sequence[Any] = ()
         part, order, key = random_flange(rng)
     elif rng.random() < DRILLED:
         part = random_drilled(rng)
-    mesh = _random_mesh(rng, meshes) if part is None else None
+    mesh: Any = _random_mesh(rng, meshes) if part is None else None
     whole = sample_surface(mesh, count, rng) if part is None else part.sample(count, rng)
 
     middle = (whole.min(0) + whole.max(0)) / 2

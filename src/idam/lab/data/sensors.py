@@ -158,10 +158,13 @@ def _unit(around: Array, upward: Array) -> Array:
     """Unit rays (N, 3) by azimuth and elevation, of shapes that broadcast."""
     around, upward = np.broadcast_arrays(around, upward)
     level = np.cos(upward)
-    return np.stack([level * np.cos(around), level * np.sin(around), np.sin(upward)], -1).reshape(-1, 3)
+    rays: Array = np.stack([level * np.cos(around), level * np.sin(around), np.sin(upward)], -1).reshape(-1, 3)
+    return rays
 
 
 def _looking(turn: float, nod: float) -> Array:
     """The rotation (3, 3) of a camera that nods (upwards) and then turns about the vertical."""
     (c, s), (cn, sn) = (np.cos(turn), np.sin(turn)), (np.cos(nod), np.sin(nod))
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[cn, 0, -sn], [0, 1, 0], [sn, 0, cn]])
+    turned, nodded = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([[cn, 0, -sn], [0, 1, 0], [sn, 0, cn]])
+    rotation: Array = turned @ nodded
+    return rotation
