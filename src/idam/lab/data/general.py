@@ -218,6 +218,11 @@ def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> Sca
         noisy[stray] += 0.3 * rng.normal(size=(stray.sum(), 3))
         clouds.append(noisy)
     source, target = clouds[0], clouds[1] @ truth[:3, :3].T
+    return as_matched(source, target, truth, rng)
+
+
+def as_matched(source: Points, target: Points, truth: Points, rng: np.random.Generator) -> ScanPair | None:
+    """Two scans at a resolution that :func:`idam.register` matches; None where too few points are left."""
     return _in_working_coordinates(source, target, truth, int(rng.choice(COUNTS, p=SHARES)))
 
 

@@ -18,8 +18,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from idam.errors import InputError
-from idam.lab.data.general import Material, ScanPair, draw_halves, draw_scans, load_meshes
+from idam.lab.data.general import Material, ScanPair, as_matched, draw_halves, draw_scans, load_meshes
 from idam.lab.data.modelnet40 import load
+from idam.lab.data.sensor_pairs import draw_sensor_pair
 from idam.lab.training.batches import VALIDATION_SEED, generator_at
 from idam.lab.training.checkpoint import initial_model
 from idam.lab.training.recipe import Recipe
@@ -41,6 +42,8 @@ AMBIGUOUS = 2.5
 """Spacings within which other points are neither right nor wrong."""
 LEAST = -1e4
 """Score of what is left out, where the logarithm of a probability must be a number."""
+SENSORS = 0.5
+"""Share of the pairs that show sensors' patterns."""
 ROWS = 200
 """Rows and columns of the similarity matrix, with a match each, that a pair teaches at a step."""
 
@@ -184,7 +187,7 @@ class GeneralTask:
         self.data = f"{self.size} pairs of scans of {surfaces}"
         self.held = f"{VALIDATION_PAIRS} pairs of scans, an eighth of the shapes and meshes held out for them"
         kept = Material(shapes[held], meshes[::HELD])
-        draw = draw_scans if recipe.experiment == "general" else draw_halves
+        draw = draw_widely if recipe.experiment == "general" else draw_halves
         # of indices that no training reaches, whatever its seed
         self.pairs = [scanned(draw, kept, VALIDATION_SEED, self.size + n) for n in range(VALIDATION_PAIRS)]
         self.pair = cache(lambda n: scanned(draw, self.material, recipe.seed, n))
@@ -241,6 +244,16 @@ def scanned(draw: Draw, material: Material, seed: int, index: int) -> ScannedPai
     aligned = torch.from_numpy(pair.source @ truth[:3, :3].T + truth[:3, 3]).float()
     source, target = (compact(surroundings(cloud, pair.spacing)) for cloud in clouds)
     return ScannedPair(source, target, aligned / pair.spacing, clouds[1] / pair.spacing)
+
+
+def draw_widely(material: Material, rng: np.random.Generator) -> ScanPair:
+    """A pair of scans of objects, rooms and streets, or as often one with a real sensor's pattern in either scan."""
+    while rng.random() < SENSORS:
+        pair = draw_sensor_pair(rng)
+        scans = as_matched(pair.source, pair.target, pair.transformation, rng)
+        if scans is not None:
+            return scans
+    return draw_scans(material, rng)
 
 
 def unsigned(seed: int) -> int:
