@@ -31,7 +31,7 @@ from idam.network.supervision import negative_entropy_loss
 
 __all__ = ["GeneralStep", "GeneralTask", "MatchLoss", "ScannedPair", "learns_features_alone", "matching_of"]
 
-PAIRS = {"general": 9600, "practice-any-rotation": 24_000}
+PAIRS = {"general": 3200, "practice-any-rotation": 24_000}
 """Different pairs to train on, by what for: drawn once, and then kept, in some 4 GB."""
 VALIDATION_PAIRS = 100
 HELD = 8
@@ -42,7 +42,7 @@ AMBIGUOUS = 2.5
 """Spacings within which other points are neither right nor wrong."""
 LEAST = -1e4
 """Score of what is left out, where the logarithm of a probability must be a number."""
-SENSORS = 0.5
+SENSORS = 0.65
 """Share of the pairs that show sensors' patterns."""
 ROWS = 200
 """Rows and columns of the similarity matrix, with a match each, that a pair teaches at a step."""
