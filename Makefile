@@ -22,7 +22,7 @@ test: $(VENV)/.installed-dev ## run the tests
 	$(BIN)/python -m pytest
 
 test-core: $(CORE)/.installed ## run the tests of the core in an environment of the core alone
-	$(CORE)/bin/python -m pytest --ignore tests/network --ignore tests/lab
+	$(CORE)/bin/python -m pytest --ignore tests/network --ignore tests/lab --ignore tests/rivals
 
 lint: $(VENV)/.installed-dev ## check style and types
 	$(BIN)/ruff check

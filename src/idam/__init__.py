@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from idam.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
+    from idam.batch import register_pairs
     from idam.clouds.prepared import Prepared
     from idam.network.pretrained import load_model
     from idam.registration import prepare, register
@@ -22,6 +23,7 @@ __all__ = [
     "load_model",
     "prepare",
     "register",
+    "register_pairs",
 ]
 
 __version__ = "0.1.0"
@@ -33,6 +35,7 @@ _LATE = {
     "load_model": "idam.network.pretrained",
     "prepare": "idam.registration",
     "register": "idam.registration",
+    "register_pairs": "idam.batch",
 }
 
 

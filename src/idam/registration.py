@@ -22,7 +22,8 @@ from idam.io import as_point_cloud, rigid_fault
 from idam.models import resolve
 from idam.result import RegistrationResult
 from idam.rigid import Array
-from idam.search.confidence import CONVERGED, confidence, doubt
+from idam.search.doubt import doubt
+from idam.search.judge import CONVERGED, confidence
 from idam.solution import solve
 
 __all__ = ["prepare", "register"]
@@ -88,17 +89,19 @@ def register(
         solution = solve(Pyramid(*clouds, voxel_size), models, guess, max_angle, refine)
     sure = confidence(solution.evidence)
     best, *others = solution.answers
+    poses = np.array([answer.transformation for answer in solution.answers])
     result = RegistrationResult(
         transformation=best.transformation,
         fitness=solution.fitness,
         inlier_rmse=solution.inlier_rmse,
         confidence=sure,
         converged=sure >= CONVERGED,
-        reason=doubt(solution.evidence) if sure < CONVERGED else "",
+        reason=doubt(solution.evidence, poses, clouds[0].centre) if sure < CONVERGED else "",
         evidence=solution.evidence,
         hypotheses=others,
         max_correspondence_distance=solution.distance,
         information=solution.information,
+        strength=solution.strength,
         matches=solution.matches,
         model=models.name,
         seconds=time.perf_counter() - started,

@@ -328,6 +328,17 @@ def test_an_experiment_is_measured_on_its_test_pairs(experiment, count, idam, da
     assert {name: found[name] for name in FIGURES} == measured(experiments.test_set(experiment, data).pairs, experiment)
 
 
+def test_one_s_own_method_and_bounds(idam, file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my_method.py").write_text("import numpy as np\ndef align(source, target):\n    return np.eye(4)\n")
+    words = ("evaluate", "--pairs", file, "--method", "my_method:align", "--within", 180, 100, "--json", "out.json")
+    outcome = idam(*words)
+    assert outcome.code == 0
+    found = json.loads(Path("out.json").read_text())
+    assert (found["method"], found["recall"], found["recall_within"]) == ("my_method:align", 1.0, [180, 100])
+    assert "align" in outcome.out
+
+
 def not_pairs(path: Path) -> None:
     path.write_text("0 0 0\n")
 
@@ -347,6 +358,13 @@ BAD_EVALUATIONS = {
     "an unknown model": (["evaluate", "--pairs", "FILE", "--method", "gnn-idam", "--model", "sift"], "unknown model"),
     "no pairs": (["evaluate", "--pairs", "FILE", "--method", "gnn-idam", "--limit", 0], "limit"),
     "a negative limit": (["evaluate", "--pairs", "FILE", "--method", "gnn-idam", "--limit", -1], "limit"),
+    "a model that is no network of the paper": (
+        ["evaluate", "--pairs", "FILE", "--method", "gnn-idam", "--model", "general"],
+        "general",
+    ),
+    "bounds of an experiment": (["evaluate", "unseen-shapes", "--data", "DATA", "--within", 1, 1], "--within"),
+    "one bound": (["evaluate", "--pairs", "FILE", "--within", 1], "--within"),
+    "a method that is nowhere": (["evaluate", "--pairs", "FILE", "--method", "nowhere:align"], "nowhere:align"),
     "an output that cannot be": (["evaluate", "--pairs", "FILE", "--method", "gnn-idam", "--json", "no/x"], "no/x"),
 }
 

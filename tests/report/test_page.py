@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.report.page import MAX_POINTS, RUNNERS_UP, write_report
 from idam.result import Hypothesis, Matches, RegistrationResult
-from idam.search.confidence import Evidence
 
 HERE = (0.0, 0.0, 0.0)
 NATIONAL_GRID = (512_300.0, 5_403_200.0, 320.0)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.result import Matches, RegistrationResult
-from idam.search.confidence import Evidence
 
 matplotlib = pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
 

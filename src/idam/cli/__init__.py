@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated, NoReturn
 
 import typer
 
 from idam import __version__
+from idam.cli.apply import apply
+from idam.cli.batch import batch
 from idam.cli.data import data
 from idam.cli.demo import demo
 from idam.cli.evaluate import evaluate
 from idam.cli.figures import figures
+from idam.cli.info import info
 from idam.cli.models import models
 from idam.cli.register import register
 from idam.cli.shared import BAD_INPUT
@@ -20,11 +24,14 @@ from idam.errors import InputError, MissingDependencyError
 
 __all__ = ["main"]
 
+BROKEN_PIPE = 141
+"""What shells make of a program whose reader has gone, as ``| head`` does."""
+
 app = typer.Typer(
     name="idam",
     help="Learned global registration of partially overlapping 3D point clouds.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
@@ -33,11 +40,19 @@ app = typer.Typer(
 def main() -> NoReturn:
     """Run the command line; bad input ends in one line on stderr and exit code 2."""
     try:
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="idam")
+        sys.stdout.flush()
     except (InputError, MissingDependencyError) as error:
         stop(str(error), BAD_INPUT)
     except (KeyboardInterrupt, typer.Abort):
         stop("interrupted", 130)
+    except SystemExit as stopped:  # which the parser makes of a reader that has gone, with the code of an unsure answer
+        sys.exit(BROKEN_PIPE if isinstance(stopped.__context__, BrokenPipeError) else stopped.code)
+    except OSError as error:  # files raise InputError: it is the standard output
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python would try once more as it exits
+        if isinstance(error, BrokenPipeError):
+            sys.exit(BROKEN_PIPE)
+        stop(f"cannot write to the standard output ({error.strerror or error})", BAD_INPUT)
     except Exception as error:
         usage = getattr(error, "format_message", None)  # what the parser raises for a wrong call
         if usage is None:
@@ -62,6 +77,6 @@ def about(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-for command in (register, demo, models, train, evaluate, figures):
+for command in (register, batch, apply, info, demo, models, train, evaluate, figures):
     app.command()(command)
 app.add_typer(data, name="data")

@@ -23,14 +23,27 @@ def evaluate(
         ),
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")] = None,
-    pairs: Annotated[Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t.")] = None,
-    method: Annotated[list[str] | None, typer.Option(help="Rows to compute; all if left out.")] = None,
+    pairs: Annotated[
+        Path | None, typer.Option(help="Your own pairs: .npz of source, target, R and t, or .json of files.")
+    ] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(help="Rows to compute, or your own package.module:function; all rows if left out."),
+    ] = None,
     model: Annotated[
-        str | None, typer.Option(help="Weights for the learned rows; those trained for the experiment if left out.")
+        str | None,
+        typer.Option(
+            help="Weights for the learned rows; those trained for the experiment if left out. Of the ablation, the "
+            "folder that benchmarks/ablation.py wrote, or that IDAM_ABLATION names."
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="A setting of the one method asked for."),
+    ] = None,
+    within: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="DEGREES DISTANCE", help="With --pairs: errors up to which an answer is right. [5 0.05]"),
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only so many pairs, for a quick look.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the pairs.")] = 1,
@@ -46,14 +59,18 @@ def evaluate(
       idam evaluate gaussian-noise --data modelnet40 --method fgr --set fgr_distance=0.05
 
       idam evaluate --pairs pairs.npz --method gnn-idam --model gnn-unseen-shapes --json out.json
+
+      idam evaluate --pairs scans/pairs.json --method register --method mine:align --within 5 0.01
     """
     from idam.lab.evaluation.evaluate import evaluate as run
     from idam.lab.evaluation.experiments import read_pairs, test_set
 
     if (experiment is None) == (pairs is None):
         raise InputError("give either an experiment with --data or your own --pairs")
+    if within is not None and pairs is None:
+        raise InputError("--within is for your own --pairs: an experiment has bounds of its own")
     if pairs is not None:
-        test = read_pairs(pairs)
+        test = read_pairs(pairs, within)
     elif data is None:
         raise InputError("an experiment needs --data, the folder of ModelNet40")
     else:

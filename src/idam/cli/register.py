@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Annotated
 
@@ -15,12 +16,14 @@ from idam.errors import InputError
 
 __all__ = ["register"]
 
+STANDARD = Path("-")
+
 
 def register(
     source: Annotated[Path, typer.Argument(help="The cloud to move.")],
     target: Annotated[Path, typer.Argument(help="The cloud to lay it on.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write the moved source here, colours and normals kept.")
+        Path | None, typer.Option("--output", "-o", help="Write the moved source here, with all that it holds.")
     ] = None,
     transform: Annotated[Path | None, typer.Option(help="Write the 4x4 here.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the whole result here.")] = None,
@@ -47,8 +50,9 @@ def register(
 ) -> None:
     """Lay SOURCE on TARGET: print the transform and how sure it is.
 
-    The files may be PLY, PCD, XYZ, TXT, CSV, PTS, NPY, NPZ, OBJ, STL, OFF, LAS or LAZ. The exit code is 0 for a
-    confident answer, 1 for one that is likely wrong and 2 for bad input.
+    The files may be PLY, PCD, XYZ, TXT, CSV, PTS, PTX, E57, LAS, LAZ, BIN, NPY, NPZ, OBJ, STL, OFF or GLB, also
+    packed as .gz; - is text from the standard input, or to the standard output. The exit code is 0 for a confident
+    answer, 1 for one that is likely wrong and 2 for bad input.
 
     [bold]Examples[/bold]
 
@@ -60,10 +64,12 @@ def register(
     """
     from idam import registration
     from idam.io import (
-        check_destination,
+        check_outputs,
         check_writable,
+        move_file,
         read_point_cloud,
         read_transform,
+        write_json,
         write_point_cloud,
         write_transform,
     )
@@ -71,9 +77,8 @@ def register(
     # before the work, and before the first of them is written
     if output is not None:
         check_writable(output)
-    for path in (transform, json, html, save_plot):
-        if path is not None:
-            check_destination(path)
+    outputs = output, transform, json, html, save_plot
+    check_outputs(outputs, [path for path in (source, target, init) if path is not None])
     if save_plot is not None:
         check_drawable(save_plot)
     source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
@@ -90,12 +95,14 @@ def register(
             seed=seed,
             device=device,
         )
-    if output is not None:
+    if output is not None and source == STANDARD:  # which has been read
         write_point_cloud(output, source_cloud.transformed(result.transformation))
+    elif output is not None:
+        move_file(source, result.transformation, output)
     if transform is not None:
         write_transform(transform, result.transformation)
     if json is not None:
-        result.save(json)
+        write_json(json, result.to_dict())
     if html is not None:
         from idam.report.page import write_report
 
@@ -104,7 +111,8 @@ def register(
         from idam.report.plot import write_plot
 
         write_plot(save_plot, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
-    show(result, quiet)
+    with redirect_stdout(sys.stderr if STANDARD in outputs else sys.stdout):
+        show(result, quiet)
     if not result.converged:
         raise typer.Exit(UNSURE)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,32 +18,78 @@ __all__ = [
     "check_size",
     "cloud_from_columns",
     "cloud_from_table",
+    "finite",
     "finite_cloud",
+    "has_angles",
     "has_positions",
+    "log",
+    "looks_like_colors",
+    "looks_like_normals",
+    "named_cloud",
+    "normal_names",
     "parse_numbers",
-    "positions",
+    "position_names",
+    "to_uint8",
+    "unnamed_cloud",
+    "without_windows_nan",
 ]
 
 Numbers = NDArray[Any]
+log = logging.getLogger("idam.io")
+"""What readers leave out is said here, at the level INFO; ``idam info`` shows it."""
 
-_POSITIONS = (("x", "y", "z"), ("points:0", "points:1", "points:2"))
+_POSITIONS = (
+    ("x", "y", "z"),
+    ("points:0", "points:1", "points:2"),
+    ("points_0", "points_1", "points_2"),
+    ("pos_x", "pos_y", "pos_z"),
+    ("position_x", "position_y", "position_z"),
+    ("coord_x", "coord_y", "coord_z"),
+    ("x_coord", "y_coord", "z_coord"),
+    ("x coordinate", "y coordinate", "z coordinate"),
+)
+# survey's names: any of the first for x, with any of the second for y, with any of the third for z
+_SURVEY = (
+    ("easting", "east", "e", "rechtswert", "este"),
+    ("northing", "north", "n", "hochwert", "norte"),
+    ("height", "elevation", "elev", "altitude", "alt", "z", "h", "höhe", "hoehe", "cota"),
+)
+_ANGLES = {"lat", "latitude", "lon", "long", "lng", "longitude"}
 _COLORS = (
     ("red", "green", "blue"),
     ("r", "g", "b"),
     ("rf", "gf", "bf"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
 )
-_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normals:0", "normals:1", "normals:2"))
+_NORMALS = (
+    ("nx", "ny", "nz"),
+    ("normal_x", "normal_y", "normal_z"),
+    ("normals:0", "normals:1", "normals:2"),
+    ("normals_0", "normals_1", "normals_2"),
+)
+_UNIT = re.compile(r"\s*[\[({]\s*([^\])}]*?)\s*[\])}]\s*$")
 
 # Where a colour or a normal may start in a table without names: x y z and a triple; x y z intensity and a triple (PTS);
 # x y z and two triples. With any other number of columns there is no telling.
 _TRIPLES = {6: (3,), 7: (4,), 9: (3, 6)}
 
+# C runtimes of Windows write 1.#QNAN, -1.#IND, 1.#INF and, rounded, 1.#R or -1.$ ; newer ones -nan(ind); Excel #N/A.
+_WINDOWS_NAN = re.compile(rb"[+-]?\d\.[#$]\w*|[+-]?nan\(\w*\)|#(?:N/A|NUM!|DIV/0!|VALUE!|REF!)", re.IGNORECASE)
 
-def has_positions(names: list[str]) -> bool:
+
+def plain_name(name: str) -> str:
+    """A column's name in small letters, without its unit: ``x`` for ``X [m]``."""
+    return _UNIT.sub("", name.strip()).strip().casefold()
+
+
+def has_positions(names: Sequence[str]) -> bool:
     """Tell whether the names of columns say where the coordinates are."""
-    known = {name.casefold() for name in names}
-    return any(known.issuperset(triple) for triple in _POSITIONS)
+    return _find(names, _POSITIONS) is not None or _find_survey(names) is not None
+
+
+def has_angles(names: Sequence[str]) -> bool:
+    """Tell whether the names of columns say that coordinates are latitude and longitude."""
+    return bool(_ANGLES & {plain_name(name) for name in names})
 
 
 def cloud_from_columns(columns: Mapping[str, Numbers]) -> PointCloud:
@@ -50,60 +98,125 @@ def cloud_from_columns(columns: Mapping[str, Numbers]) -> PointCloud:
     Raises:
         InputError: there are no coordinates, or no finite ones.
     """
-    return finite_cloud(positions(columns), _triple(columns, _COLORS), _triple(columns, _NORMALS))
+    return finite(named_cloud(columns))
 
 
-def positions(columns: Mapping[str, Numbers]) -> Numbers:
-    """Find the coordinates (N, 3) among named columns.
+def named_cloud(columns: Mapping[str, Numbers]) -> PointCloud:
+    """Find the cloud in named columns (N,), every point of it: what is no position, colour or normal keeps its name.
 
     Raises:
-        InputError: there are none.
+        InputError: there are no coordinates.
     """
-    points = _triple(columns, _POSITIONS)
-    if points is None:
+    names = list(columns)
+    places = position_names(names), _find(names, _COLORS), normal_names(names)
+    points, colors, normals = (
+        None if found is None else np.stack([columns[name] for name in found], axis=1) for found in places
+    )
+    assert points is not None
+    taken = {name for found in places if found for name in found}
+    return _cloud(points, colors, normals, {name: columns[name] for name in names if name not in taken})
+
+
+def position_names(columns: Sequence[str]) -> Sequence[str]:
+    """Find which of the names are those of x, y and z.
+
+    Raises:
+        InputError: none are, or they have different units.
+    """
+    names = _find(columns, _POSITIONS) or _find_survey(columns)
+    if names is None:
+        if has_angles(columns):
+            raise InputError("its coordinates are degrees of latitude and longitude: project them to metres first")
         found = ", ".join(columns)[:60] or "none"
         raise InputError(f"has no columns x, y and z (found: {found}): export it with coordinates")
-    return points
+    units = {match[1].casefold() for name in names if (match := _UNIT.search(name.strip()))}
+    if len(units) > 1:
+        raise InputError(f"its coordinates have different units ({', '.join(sorted(units))}): convert them to one")
+    return names
 
 
 def cloud_from_table(table: Numbers) -> PointCloud:
-    """Find the cloud in a table (N, 3 or more) without names: coordinates, then what looks like colours or normals.
+    """Do as :func:`unnamed_cloud`, less the points that are not finite.
 
     Raises:
         InputError: there are no finite coordinates.
     """
+    return finite(unnamed_cloud(table))
+
+
+def unnamed_cloud(table: Numbers) -> PointCloud:
+    """Find the cloud in a table (N, 3 or more) without names: coordinates, then what looks like colours or normals."""
     colors = normals = None
+    taken = {0, 1, 2}
     for start in _TRIPLES.get(table.shape[1], ()):
         triple = table[:, start : start + 3]
-        if normals is None and _looks_like_normals(triple):
+        if normals is None and looks_like_normals(triple):
             normals = triple
-        elif colors is None and _looks_like_colors(triple):
+        elif colors is None and looks_like_colors(triple):
             colors = triple.astype(np.int64)
-    return finite_cloud(table[:, :3], colors, normals)
+        else:
+            continue
+        taken |= {start, start + 1, start + 2}
+    rest = {f"column_{index + 1}": table[:, index] for index in range(table.shape[1]) if index not in taken}
+    return _cloud(table[:, :3], colors, normals, rest)
 
 
-def finite_cloud(points: Numbers, colors: Numbers | None, normals: Numbers | None) -> PointCloud:
+def finite_cloud(
+    points: Numbers,
+    colors: Numbers | None = None,
+    normals: Numbers | None = None,
+    attributes: Mapping[str, Numbers] | None = None,
+) -> PointCloud:
+    """Make a cloud of arrays as files have them, less the points that are not finite.
+
+    Raises:
+        InputError: no point is left.
+    """
+    return finite(_cloud(points, colors, normals, attributes or {}))
+
+
+def finite(cloud: PointCloud) -> PointCloud:
     """Leave out the points with a NaN or infinite coordinate, which depth cameras write where they saw nothing.
 
     Raises:
         InputError: no point is left.
     """
-    if not len(points):
+    if not len(cloud.points):
         raise InputError("holds no points: export it again")
-    points = points.astype(np.float64, copy=False)  # before the check: what an extended float holds, a double may not
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
-        raise InputError(f"every one of its {len(points):,} points is NaN or infinite: export it again")
+    rows = np.asarray(np.isfinite(cloud.points).all(axis=1))
+    if rows.all():
+        return cloud
+    if not rows.any():
+        raise InputError(f"every one of its {len(rows):,} points is NaN or infinite: export it again")
+    log.info("left out %s points that are NaN or infinite", f"{np.count_nonzero(~rows):,}")
+    return cloud.where(rows)
+
+
+def _cloud(
+    points: Numbers, colors: Numbers | None, normals: Numbers | None, attributes: Mapping[str, Numbers]
+) -> PointCloud:
     return PointCloud(
-        points[finite],
-        None if colors is None else _to_uint8(colors)[finite],
-        None if normals is None else normals[finite].astype(np.float64),
+        points.astype(np.float64, copy=False),  # what an extended float holds, a double may not
+        None if colors is None else to_uint8(colors),
+        None if normals is None else normals.astype(np.float64),
+        attributes,
     )
 
 
 def parse_numbers(text: bytes) -> NDArray[np.float64]:
-    """Read all numbers of a text separated by white space, line ends included."""
-    return np.fromiter(map(float, text.split()), np.float64)
+    """Read all numbers of a text separated by white space, line ends included.
+
+    Raises:
+        ValueError: a word is no number.
+    """
+    if b"_" in text:  # which Python takes between digits
+        raise ValueError("a number holds '_'")
+    return np.fromiter(map(float, without_windows_nan(text).split()), np.float64)
+
+
+def without_windows_nan(text: bytes) -> bytes:
+    """Spell numbers that are none in the way that Python reads them."""
+    return _WINDOWS_NAN.sub(b"nan", text) if b"#" in text or b"$" in text or b"(" in text else text
 
 
 def check_size(needed: int, available: int, what: str, unit: str = "bytes") -> None:
@@ -119,25 +232,36 @@ def check_size(needed: int, available: int, what: str, unit: str = "bytes") -> N
         )
 
 
-def _triple(columns: Mapping[str, Numbers], choices: tuple[tuple[str, str, str], ...]) -> Numbers | None:
-    lower = {name.casefold(): values for name, values in columns.items()}
-    for names in choices:
-        if all(name in lower for name in names):
-            return np.stack([lower[name] for name in names], axis=1)
-    return None
+def normal_names(names: Sequence[str]) -> Sequence[str] | None:
+    """Find which of the names are those of a normal, if any."""
+    return _find(names, _NORMALS)
 
 
-def _looks_like_normals(triple: Numbers) -> bool:
+def _find(names: Sequence[str], choices: tuple[tuple[str, str, str], ...]) -> Sequence[str] | None:
+    """The three names, as the file spells them, that are one of the choices."""
+    plain = {plain_name(name): name for name in names}
+    return next(([plain[each] for each in choice] for choice in choices if all(map(plain.__contains__, choice))), None)
+
+
+def _find_survey(names: Sequence[str]) -> Sequence[str] | None:
+    plain = {plain_name(name): name for name in names}
+    found = [next((plain[each] for each in choice if each in plain), "") for choice in _SURVEY]
+    return found if all(found) else None
+
+
+def looks_like_normals(triple: Numbers) -> bool:
+    """Whether the rows (N, 3) are of length 1, or 0 where there is no normal."""
     length = np.linalg.norm(triple, axis=1)
     unit = np.abs(length - 1) < 0.01
     return bool(unit.any() and (unit | (length == 0)).all())
 
 
-def _looks_like_colors(triple: Numbers) -> bool:
+def looks_like_colors(triple: Numbers) -> bool:
+    """Whether the rows (N, 3) are whole numbers of 0 to 255."""
     return bool(((triple >= 0) & (triple <= 255) & (triple == np.round(triple))).all())
 
 
-def _to_uint8(colors: Numbers) -> NDArray[np.uint8]:
+def to_uint8(colors: Numbers) -> NDArray[np.uint8]:
     """Colours of 0 to 255, of 0 to 1 if they are fractions, or of 0 to 65535 if they go that far."""
     if colors.dtype == np.uint8:
         return colors

@@ -9,8 +9,9 @@ import math
 import os
 import secrets
 import shutil
+import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,16 @@ import numpy as np
 from idam.errors import InputError
 
 __all__ = [
+    "STANDARD",
     "StrPath",
     "check_destination",
+    "check_outputs",
+    "check_source",
     "check_unpacked_size",
     "make_folder",
     "one_line",
     "read_bytes",
+    "replacing",
     "silenced",
     "write_bytes",
     "write_json",
@@ -32,10 +37,32 @@ __all__ = [
 ]
 
 StrPath = str | os.PathLike[str]
+STANDARD = "-"
+"""The name that means the standard input or output."""
 
 
 def read_bytes(path: StrPath) -> bytes:
-    """Read a file that is there, regular, readable and not empty.
+    """Read a file that is there, regular, readable and not empty; ``-`` is the standard input.
+
+    Raises:
+        InputError: it is not.
+    """
+    if os.fspath(path) == STANDARD:
+        return _read_standard_input()
+    file = check_source(path)
+    try:
+        data = file.read_bytes()
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    except MemoryError as error:
+        raise InputError(f"{path}: does not fit into memory: thin it out first") from error
+    if not data:
+        raise _empty(path)
+    return data
+
+
+def check_source(path: StrPath) -> Path:
+    """Find out whether a file is there, regular and not empty.
 
     Raises:
         InputError: it is not.
@@ -48,30 +75,102 @@ def read_bytes(path: StrPath) -> bytes:
             raise InputError(f"{path}: no such file: check the path")
         if not file.is_file():  # a pipe would never end
             raise InputError(f"{path}: not a regular file: copy what it gives into one first")
-        data = file.read_bytes()
+        if not file.stat().st_size:
+            raise _empty(path)
     except InputError:
         raise
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({one_line(error)}): check its permissions") from error
-    except MemoryError as error:
-        raise InputError(f"{path}: does not fit into memory: thin it out first") from error
+        raise _unreadable(path, error) from error
+    return file
+
+
+def _read_standard_input() -> bytes:
+    if sys.stdin is None or sys.stdin.isatty():
+        raise InputError("-: nothing is piped to the standard input: name a file")
+    data = sys.stdin.buffer.read()
     if not data:
-        raise InputError(f"{path}: is empty (0 bytes): copy or export it again")
+        raise InputError("-: the standard input is empty, or has been read already: name a file")
     return data
+
+
+def _unreadable(path: StrPath, error: Exception) -> InputError:
+    return InputError(f"{path}: cannot be read ({one_line(error)}): check its permissions")
+
+
+def _empty(path: StrPath) -> InputError:
+    return InputError(f"{path}: is empty (0 bytes): copy or export it again")
 
 
 def write_bytes(path: StrPath, data: bytes) -> None:
     """Write a file through a temporary one in the same folder, so that it is there whole or not at all.
 
+    ``-`` is the standard output.
+
     Raises:
         InputError: the folder is missing, or the file cannot be written.
     """
+    if os.fspath(path) == STANDARD:
+        sys.stdout.flush()
+        sys.stdout.buffer.write(data)
+        return
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextlib.contextmanager
+def replacing(path: StrPath) -> Iterator[Path]:
+    """A new file beside ``path``, to be written, that takes its place at the end; on an error, all is as it was.
+
+    Raises:
+        InputError: the folder is missing, or the file cannot be written.
+    """
+    target = check_destination(path)
+    temporary = target.with_name(f".idam-{secrets.token_hex(8)}.tmp")
     try:
-        _replace(check_destination(path), data)
+        temporary.touch(exist_ok=False)
+        yield temporary
+        if target.exists():
+            shutil.copymode(target, temporary)
+        temporary.replace(target)
     except InputError:
         raise
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be written ({one_line(error)}): write to another folder") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def check_outputs(outputs: Iterable[StrPath | None], inputs: Iterable[StrPath] = ()) -> None:
+    """Find out before the work whether all outputs can be written, each to a file of its own that is no input.
+
+    Raises:
+        InputError: one cannot, or it would overwrite an input or another output.
+    """
+    taken = {_identity(path): path for path in inputs if os.fspath(path) != STANDARD}
+    read = set(taken)
+    for path in outputs:
+        if path is None:
+            continue
+        check_destination(path)
+        key = _identity(path)
+        if key in read:
+            raise InputError(f"{path}: would overwrite an input: write to another file")
+        if key in taken:
+            raise InputError(f"{path}: two outputs to one file: give each its own")
+        taken[key] = path
+
+
+def _identity(path: StrPath) -> object:
+    """What two names of one file share."""
+    if os.fspath(path) == STANDARD:
+        return STANDARD
+    name = os.path.realpath(path)
+    try:
+        stat = os.stat(name)  # noqa: PTH116
+    except (OSError, ValueError):
+        return name
+    return stat.st_dev, stat.st_ino
 
 
 def check_destination(path: StrPath) -> Path:
@@ -80,6 +179,8 @@ def check_destination(path: StrPath) -> Path:
     Raises:
         InputError: it cannot be written, as far as one can tell without trying.
     """
+    if os.fspath(path) == STANDARD:
+        return Path(path)
     try:
         target = Path(os.path.realpath(path))  # through a symbolic link, not over it
         if not target.parent.is_dir():
@@ -111,19 +212,6 @@ def make_folder(path: StrPath) -> Path:
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: this folder is write-protected: choose another")
     return folder
-
-
-def _replace(target: Path, data: bytes) -> None:
-    temporary = target.with_name(f".idam-{secrets.token_hex(8)}.tmp")
-    try:
-        with temporary.open("xb") as stream:
-            stream.write(data)
-        if target.exists():
-            shutil.copymode(target, temporary)
-        temporary.replace(target)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: StrPath, text: str) -> None:

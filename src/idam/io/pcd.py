@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 from idam.io.cloud import PointCloud
-from idam.io.columns import check_size, cloud_from_columns, parse_numbers
+from idam.io.columns import check_size, cloud_from_columns, log, parse_numbers
 from idam.io.files import check_unpacked_size
+from idam.io.mesh import coordinate_type
 
-__all__ = ["decode", "encode"]
+__all__ = ["decode", "encode", "unpack_colors"]
 
 _END_OF_HEADER = re.compile(rb"^DATA[ \t]+(ascii|binary_compressed|binary)[ \t]*\r?$\n?", re.MULTILINE)
 _PACKED_COLORS = ("rgb", "rgba")
@@ -42,14 +43,18 @@ def decode(data: bytes) -> PointCloud:
     body = data[match.end() :]
     read = {b"ascii": _read_ascii, b"binary": _read_binary, b"binary_compressed": _read_compressed}[match[1]]
     columns = dict(zip(header.names, read(header, body), strict=True))
-    return cloud_from_columns(_unpack_colors(columns))
+    wide = [name for name, count in zip(header.names, header.counts, strict=True) if count > 1 and name != "_"]
+    if wide:
+        log.info("left out fields of several numbers: %s", ", ".join(wide)[:200])
+    return cloud_from_columns({name: values for name, values in unpack_colors(columns).items() if name not in wide})
 
 
-def encode(cloud: PointCloud, coordinates: str) -> bytes:
-    """Encode a PCD file: binary with coordinates of type ``f4``, ASCII with those of ``f8``.
+def encode(cloud: PointCloud) -> bytes:
+    """Encode a PCD file: binary with float32 coordinates, ASCII with doubles where those would be rounded too much.
 
     Doubles are ASCII because Open3D reads them as zeros, without a word, from a binary file.
     """
+    coordinates = coordinate_type(cloud.points)
     fields = _fields(cloud, coordinates)
     rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, code, _ in fields])
     for name, _, values in fields:
@@ -75,6 +80,13 @@ def _fields(cloud: PointCloud, coordinates: str) -> list[tuple[str, str, NDArray
     if cloud.colors is not None:
         red, green, blue = cloud.colors.T.astype(np.uint32)
         fields.append(("rgb", "u4", red << 16 | green << 8 | blue))
+    taken = {name for name, _, _ in fields} | set(_PACKED_COLORS)
+    for name, values in cloud.attributes.items():
+        word = "_".join(name.split()) or "unnamed"
+        if word not in taken:
+            kind = values.dtype.kind if values.dtype.kind in "iuf" else "u"
+            size = min(max(values.dtype.itemsize, 4 if kind == "f" else 1), 8)
+            fields.append((word, f"{kind}{size}", values))
     return fields
 
 
@@ -172,7 +184,7 @@ def _repeat(out: bytearray, distance: int, length: int) -> None:
     out += (block * (length // len(block) + 1))[:length]
 
 
-def _unpack_colors(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def unpack_colors(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Add red, green and blue for a field that holds them in the bytes of one number."""
     unpacked = dict(columns)
     for name in _PACKED_COLORS:
@@ -183,4 +195,6 @@ def _unpack_colors(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
             bits = values.astype(np.int64)
             for color, shift in (("red", 16), ("green", 8), ("blue", 0)):
                 unpacked[color] = (bits >> shift & 255).astype(np.uint8)
+            del unpacked[name]
+    unpacked.pop("_", None)  # padding
     return unpacked

@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from idam import rigid
 from idam.errors import InputError
-from idam.io.cloud import PointCloud
-from idam.io.columns import check_size, cloud_from_columns, parse_numbers, positions
-from idam.io.mesh import fan, sample_surface, triangles
+from idam.io.cloud import Mesh, PointCloud
+from idam.io.columns import (
+    check_size,
+    finite,
+    named_cloud,
+    normal_names,
+    parse_numbers,
+    position_names,
+    without_windows_nan,
+)
+from idam.io.mesh import coordinate_type, fan, mesh_or_cloud, triangles
 
-__all__ = ["decode", "encode"]
+__all__ = ["decode", "encode", "move"]
 
 _C_NAMES = {
     "char": "int8",
@@ -27,7 +36,8 @@ _C_NAMES = {
     "float": "float32",
     "double": "float64",
 }
-_END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|$)")
+_LINE_END = re.compile(rb"ply[ \t]*(\r\n|\n\r|\n|\r)")
+_END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(?=[\r\n]|$)")
 
 Column = NDArray[Any] | list[NDArray[Any]]  # a list: of lists that differ in length, one array a row
 
@@ -35,9 +45,10 @@ Column = NDArray[Any] | list[NDArray[Any]]  # a list: of lists that differ in le
 @dataclass(frozen=True)
 class _Property:
     name: str
-    type: np.dtype[Any]
-    is_integer: bool
-    count_type: np.dtype[Any] | None  # of a list's length; None: not a list
+    type: np.dtype[Any]  # as it is read: of a text, every number is a double
+    declared: np.dtype[Any]
+    count_type: np.dtype[Any] | None = None  # of a list's length, as it is read; None: not a list
+    declared_count: np.dtype[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -47,49 +58,170 @@ class _Element:
     properties: list[_Property] = field(default_factory=list)
 
 
-def decode(data: bytes) -> PointCloud:
-    """Read the points of a PLY file; if it has faces, sample points on their surface.
+def decode(data: bytes) -> PointCloud | Mesh:
+    """Read the points of a PLY file, or the mesh if it has faces.
 
     Raises:
         InputError: the file is damaged, or has no vertices.
     """
+    _, columns = _read(data)
+    vertex = {name: column for name, column in columns.get("vertex", {}).items() if isinstance(column, np.ndarray)}
+    vertex = {name: column for name, column in vertex.items() if column.ndim == 1}
+    faces = _faces(columns.get("face", {}))
+    return mesh_or_cloud(named_cloud(vertex), faces) if len(faces) else finite(named_cloud(vertex))
+
+
+def encode(content: PointCloud | Mesh) -> bytes:
+    """Encode a binary little endian PLY file; coordinates are doubles where floats would round them too much."""
+    cloud = content.vertices if isinstance(content, Mesh) else content
+    kind = coordinate_type(cloud.points)
+    columns = dict(zip("xyz", cloud.points.T.astype(f"<{kind}"), strict=True))
+    if cloud.normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.T.astype("<f4"), strict=True))
+    if cloud.colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), cloud.colors.T, strict=True))
+    for name, values in cloud.attributes.items():
+        columns.setdefault("_".join(name.split()) or "unnamed", _storable(values))
+    properties = [_Property(name, values.dtype, values.dtype) for name, values in columns.items()]
+    elements = [_Element("vertex", len(cloud.points), properties)]
+    tables: dict[str, dict[str, Column]] = {"vertex": dict(columns)}
+    if isinstance(content, Mesh):
+        kinds = np.dtype("<i4"), np.dtype("u1")
+        corners = _Property("vertex_indices", kinds[0], kinds[0], kinds[1], kinds[1])
+        elements.append(_Element("face", len(content.faces), [corners]))
+        tables["face"] = {"vertex_indices": content.faces}
+    return _write(elements, tables)
+
+
+def move(data: bytes, transformation: rigid.Array) -> bytes:
+    """Move the vertices of a file by a rigid transform (4, 4); all its other elements and properties stay.
+
+    Raises:
+        InputError: the file is damaged, or has no vertices.
+    """
+    elements, columns = _read(data)
+    vertex: dict[str, Any] = columns.get("vertex", {})
+    alone = [name for name, column in vertex.items() if isinstance(column, np.ndarray) and column.ndim == 1]
+    names, normals = position_names(alone), normal_names(alone)
+    moved = rigid.apply(transformation, np.stack([vertex[name].astype(np.float64) for name in names], axis=1))
+    kind = np.dtype("<" + coordinate_type(moved))
+    vertex |= dict(zip(names, moved.T, strict=True))
+    if normals is not None:
+        turned = np.stack([vertex[name] for name in normals], axis=1) @ transformation[:3, :3].T
+        vertex |= dict(zip(normals, turned.T, strict=True))
+    for element in elements:
+        if element.name == "vertex":
+            for place, each in enumerate(element.properties):
+                if each.name in names and each.declared != np.float64:
+                    element.properties[place] = replace(each, declared=kind)
+                elif normals is not None and each.name in normals and each.declared.kind != "f":
+                    element.properties[place] = replace(each, declared=np.dtype("<f4"))
+    return _write(elements, columns)
+
+
+def _read(data: bytes) -> tuple[list[_Element], dict[str, dict[str, Column]]]:
+    """Read all elements of a file, and the columns of each."""
     elements, is_ascii, offset = _parse_header(data)
-    if is_ascii:  # one decoder for both: text becomes a binary file in which every type is a double
-        data, offset = parse_numbers(data[offset:]).tobytes(), 0
+    if not is_ascii:
+        return elements, _read_elements(data, offset, elements, "bytes")[0]
+    body = without_windows_nan(
+        data[offset:]
+    )  # one decoder for both: text becomes a file in which every type is a double
+    fault = InputError("damaged: it holds more numbers than its header says: export it again")
+    numbers = parse_numbers(body).tobytes()
+    try:
+        columns, end = _read_elements(numbers, 0, elements, "numbers")
+        if end == len(numbers):
+            return elements, columns
+    except InputError as error:
+        fault = error
+    try:  # surplus numbers: then what counts is where the lines end
+        return elements, _read_elements(_first_of_lines(body, elements).tobytes(), 0, elements, "numbers")[0]
+    except (InputError, ValueError, IndexError):
+        raise fault from None
+
+
+def _read_elements(
+    data: bytes, offset: int, elements: list[_Element], unit: str
+) -> tuple[dict[str, dict[str, Column]], int]:
     columns: dict[str, dict[str, Column]] = {}
     for element in elements:
-        columns[element.name], offset = _read_element(data, offset, element, "numbers" if is_ascii else "bytes")
-    if is_ascii and offset != len(data):
-        raise InputError("damaged: it holds more numbers than its header says: export it again")
-
-    vertex = {name: column for name, column in columns.get("vertex", {}).items() if isinstance(column, np.ndarray)}
-    faces = _faces(columns.get("face", {}))
-    return sample_surface(positions(vertex), faces) if len(faces) else cloud_from_columns(vertex)
+        columns[element.name], offset = _read_element(data, offset, element, unit)
+    return columns, offset
 
 
-def encode(cloud: PointCloud, coordinates: str) -> bytes:
-    """Encode a binary little endian PLY file with coordinates of type ``f4`` or ``f8``."""
-    names = {"f4": "float", "f8": "double", "u1": "uchar"}
-    fields = [(name, coordinates) for name in ("x", "y", "z")]
-    columns = [*cloud.points.T]
-    if cloud.normals is not None:
-        fields += [(name, "f4") for name in ("nx", "ny", "nz")]
-        columns += [*cloud.normals.T]
-    if cloud.colors is not None:
-        fields += [(name, "u1") for name in ("red", "green", "blue")]
-        columns += [*cloud.colors.T]
-    rows = np.empty(len(cloud.points), [(name, f"<{code}") for name, code in fields])
-    for (name, _), values in zip(fields, columns, strict=True):
-        rows[name] = values
-    properties = "".join(f"property {names[code]} {name}\n" for name, code in fields)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    return header.encode() + rows.tobytes()
+def _first_of_lines(body: bytes, elements: list[_Element]) -> NDArray[np.float64]:
+    """Take from each line of text the numbers that its row needs, and leave out those after them."""
+    lines = [line for line in body.replace(b"\r", b"\n").split(b"\n") if line.strip()][::-1]
+    kept: list[bytes] = []
+    for element in elements:
+        for _ in range(element.count):
+            words, needed = lines.pop().split(), 0
+            for each in element.properties:
+                needed += 1 if each.count_type is None else 1 + int(float(words[needed]))
+            if not 0 <= needed <= len(words):
+                raise ValueError
+            kept += words[:needed]
+    return parse_numbers(b" ".join(kept))
+
+
+def _write(elements: list[_Element], columns: dict[str, dict[str, Column]]) -> bytes:
+    """Write a binary little endian file of these elements."""
+    header, body = "ply\nformat binary_little_endian 1.0\n", b""
+    names = {kind: name for name, kind in _C_NAMES.items()}
+    for element in elements:
+        header += f"element {element.name} {element.count}\n"
+        for each in element.properties:
+            lengths = "" if each.declared_count is None else f"list {names[each.declared_count.name]} "
+            header += f"property {lengths}{names[each.declared.name]} {each.name}\n"
+        body += _rows(element, columns[element.name])
+    return f"{header}end_header\n".encode("latin-1", "replace") + body
+
+
+def _rows(element: _Element, columns: dict[str, Column]) -> bytes:
+    if element.count == 0 or not element.properties:
+        return b""
+    if any(isinstance(columns[each.name], list) for each in element.properties):  # lists that differ in length
+        return b"".join(
+            _packed(each, columns[each.name][row]) for row in range(element.count) for each in element.properties
+        )
+    fields: list[Any] = []
+    for place, each in enumerate(element.properties):
+        kind, values = each.declared.newbyteorder("<"), columns[each.name]
+        if each.declared_count is None:
+            fields.append((f"values{place}", kind))
+        else:
+            fields += [(f"length{place}", each.declared_count), (f"values{place}", kind, np.shape(values)[1:])]
+    rows = np.empty(element.count, fields)
+    for place, each in enumerate(element.properties):
+        rows[f"values{place}"] = columns[each.name]
+        if each.count_type is not None:
+            rows[f"length{place}"] = np.shape(columns[each.name])[1]
+    return rows.tobytes()
+
+
+def _packed(each: _Property, values: Any) -> bytes:
+    data = np.asarray(values).astype(each.declared.newbyteorder("<")).tobytes()
+    if each.declared_count is None:
+        return data
+    return np.asarray(len(values), each.declared_count).tobytes() + data
+
+
+def _storable(values: NDArray[Any]) -> NDArray[Any]:
+    """Values in a type that PLY has."""
+    kind = values.dtype
+    if kind.kind == "b":
+        return values.astype("u1")
+    if kind.kind in "iu" and kind.itemsize == 8:
+        small = len(values) == 0 or (values.min() >= -(2**31) and values.max() < 2**31)
+        return values.astype("<i4" if small else "<f8")
+    return values.astype(f"<{kind.kind}{min(kind.itemsize, 8)}" if kind.itemsize != 2 or kind.kind != "f" else "<f4")
 
 
 def _parse_header(data: bytes) -> tuple[list[_Element], bool, int]:
     """Find the elements, whether they are written as text, and where they start."""
-    end = _END_OF_HEADER.search(data)
-    if not data.startswith((b"ply\n", b"ply\r", b"ply ")) or end is None:
+    line_end, end = _LINE_END.match(data), _END_OF_HEADER.search(data)
+    if line_end is None or end is None:
         raise InputError("not a PLY file (no 'ply' ... 'end_header'): check what it is")
     order = None
     elements: list[_Element] = []
@@ -109,12 +241,21 @@ def _parse_header(data: bytes) -> tuple[list[_Element], bool, int]:
                 raise InputError(f"damaged: its header has the line '{line.strip()[:60]}': export it again")
     if order is None:
         raise InputError("damaged: its header has no 'format' line: export it again")
-    return elements, order == "", end.end()
+    return elements, order == "", _start_of_data(data, end.end(), line_end[1])
+
+
+def _start_of_data(data: bytes, at: int, line_end: bytes) -> int:
+    """Step over one line end as the header has them: a byte more may be a number's."""
+    if data.startswith(line_end, at):
+        # a line feed, with a carriage return before it that the header's first line lacked
+        return at + len(line_end)
+    return at + (2 if data.startswith(b"\r\n", at) else 1)
 
 
 def _property(name: str, order: str, kind: str, count_type: str | None = None) -> _Property:
-    counts = _type(count_type, order) if count_type else None
-    return _Property(name, _type(kind, order), "int" in _C_NAMES.get(kind, kind), counts)
+    if count_type is None:
+        return _Property(name, _type(kind, order), _type(kind, "<"))
+    return _Property(name, _type(kind, order), _type(kind, "<"), _type(count_type, order), _type(count_type, "<"))
 
 
 def _type(name: str, order: str) -> np.dtype[Any]:
@@ -172,7 +313,7 @@ def _named(columns: Sequence[Column], element: _Element) -> dict[str, Column]:
     """Name the columns, and make integers again of what the text of an ASCII file was read as."""
     named: dict[str, Column] = {}
     for each, column in zip(element.properties, columns, strict=True):
-        if each.is_integer and isinstance(column, np.ndarray) and column.dtype.kind == "f":
+        if each.declared.kind in "iu" and isinstance(column, np.ndarray) and column.dtype.kind == "f":
             column = column.astype(np.int64)
         named[each.name] = column
     return named

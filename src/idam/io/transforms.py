@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from idam.errors import InputError
 from idam.io.arrays import parse_npy
 from idam.io.files import StrPath, one_line, read_bytes, write_bytes, write_json, write_text
+from idam.io.notations import FORMS, parse_json, parse_text
 
 __all__ = ["format_transform", "read_transform", "rigid_fault", "write_transform"]
 
@@ -21,10 +20,12 @@ _LARGEST = 2**20  # bytes: a result of register() takes a few thousand
 
 
 def read_transform(path: StrPath) -> NDArray[np.float64]:
-    """Read a rigid transform (4, 4): 16 numbers of text, JSON (bare, or under "transformation"), or NPY.
+    """Read a rigid transform (4, 4): text in the notations of :mod:`idam.io.notations`, JSON or NPY.
+
+    JSON is the matrix, or an object with it under "transformation". ``-`` is text from the standard input.
 
     Raises:
-        InputError: the file cannot be read, or holds something else than a rotation and a translation.
+        InputError: the file cannot be read, or holds something else than one rotation and translation.
     """
     data = read_bytes(path)
     if len(data) > _LARGEST:
@@ -32,6 +33,8 @@ def read_transform(path: StrPath) -> NDArray[np.float64]:
     try:
         with np.errstate(all="ignore"):
             matrix = _DECODERS.get(Path(path).suffix.lower(), _decode_text)(data)
+    except InputError as error:
+        raise InputError(f"{path}: holds no 4 x 4 transform: {error}") from error
     except Exception as error:  # there is no telling what parsers throw at a damaged file
         raise InputError(f"{path}: holds no 4 x 4 transform ({one_line(error)}): save 4 lines of 4 numbers") from error
     fault = rigid_fault(matrix)
@@ -40,17 +43,19 @@ def read_transform(path: StrPath) -> NDArray[np.float64]:
     return matrix
 
 
-def format_transform(T: ArrayLike) -> str:
+def format_transform(T: ArrayLike, form: str = "matrix") -> str:
     """Write a transform as 4 lines of 4 numbers, ready to paste into CloudCompare's "Apply transformation".
 
-    Every number is in the shortest form that reads back the same.
+    Every number is in the shortest form that reads back the same. ``form`` may be one of
+    :data:`idam.io.notations.FORMS` instead.
     """
-    matrix = np.asarray(T, np.float64) + 0.0  # no -0.0
-    return "\n".join(" ".join(map(repr, row)) for row in matrix.tolist())
+    return FORMS[form](np.asarray(T, np.float64))
 
 
 def write_transform(path: StrPath, T: ArrayLike) -> None:
-    """Write a transform, atomically, as :func:`read_transform` reads it: JSON, NPY, or text under any other extension.
+    """Write a transform, atomically, as :func:`read_transform` reads it.
+
+    The extension is the form: .json, .npy, .tum and .kitti (a line each), and 4 lines of text under any other.
 
     Raises:
         InputError: it cannot be written.
@@ -63,16 +68,12 @@ def write_transform(path: StrPath, T: ArrayLike) -> None:
         np.save(stream, np.asarray(T, np.float64), allow_pickle=False)
         write_bytes(path, stream.getvalue())
     else:
-        write_text(path, format_transform(T) + "\n")
+        form = suffix.removeprefix(".")
+        write_text(path, format_transform(T, form if form in ("tum", "kitti") else "matrix") + "\n")
 
 
 def _decode_json(data: bytes) -> NDArray[np.float64]:
-    content: Any = json.loads(data)
-    if isinstance(content, dict):
-        if "transformation" not in content:
-            raise InputError('no key "transformation"')
-        content = content["transformation"]
-    return np.asarray(content, np.float64)
+    return parse_json(json.loads(data))
 
 
 def _decode_npy(data: bytes) -> NDArray[np.float64]:
@@ -80,8 +81,9 @@ def _decode_npy(data: bytes) -> NDArray[np.float64]:
 
 
 def _decode_text(data: bytes) -> NDArray[np.float64]:
-    text = re.sub(r"#.*|[,;\[\]]", " ", data.decode())
-    return np.array([float(word) for word in text.split()]).reshape(4, 4)
+    if data.lstrip().startswith(b"{"):
+        return _decode_json(data)
+    return parse_text(data.decode())
 
 
 _DECODERS = {".json": _decode_json, ".npy": _decode_npy}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from idam.io import PointCloud, write_text
 from idam.report.view import approach, chance, frame, guess_up, sample
 from idam.result import Matches, RegistrationResult
-from idam.search.confidence import CONVERGED
+from idam.search.judge import CONVERGED
 
 __all__ = ["MAX_POINTS", "write_report"]
 
@@ -40,12 +40,17 @@ _VERDICTS = (
 """From this confidence on: the style of the bar, and what it means."""
 
 _EVIDENCE = {
-    "overlap": "Agreement of the clouds where they lie on each other, 0 to 1",
-    "margin": "How much less the next best answer scores, as a share",
-    "support": "Share of the feature matches that the answer brings together",
     "likelihood": "How much likelier the features make the answer than chance, as a logarithm",
+    "overlap": "Overlap: mean share of both clouds that lies on the other, 0 to 1",
+    "contained": "Share of the better covered cloud that lies on the other, 0 to 1",
+    "support": "Share of the feature matches that the answer brings together",
+    "violation": "Share of the points that lie where the other scan saw through",
+    "close": "Share of what touches that touches at a finer resolution, too",
+    "off": "Distance from the other surface, as a share of the reach",
+    "border": "How cleanly each sparse cloud ends where the other goes on, 0 to 1",
+    "lead": "How far it is ahead of the next best answer, in logits",
 }
-"""What the fields of :class:`idam.search.confidence.Evidence` are called on the page."""
+"""What the fields of :class:`idam.search.judge.Evidence` are called on the page."""
 
 RUNNERS_UP = 3
 """Other answers a page names at most."""

@@ -5,17 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from idam import rigid
-from idam.align import reaches
+from idam.align import align, reaches
 from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
 from idam.rigid import Array
-from idam.search.confidence import CLOSE, Evidence, confidence
 from idam.search.consensus import agreeing_transforms
+from idam.search.judge import Evidence, confidence, evidence, weight
 from idam.search.matching import Matching
 from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, verified
 from idam.search.scope import Scope
@@ -42,10 +43,14 @@ TAUGHT = 90.0
 """Degrees that the pairs which a network of the paper's kind is taught are turned at most."""
 NEAR = 20.0
 """Degrees from such a network's answer within which transforms are looked into."""
+HOMING = 8.0, 4.0, 2.0
+"""Spacings within which points pull on each other from a caller's guess."""
 VERIFIED = 4
 """Answers at most that are refined on the fine clouds before one is chosen."""
 CONTENDS = 0.3
 """Share of the best score from which on an answer is refined on the fine clouds, too."""
+TIED = 0.2
+"""Logits by which answers are as likely as the best: a symmetric object's poses differ by chance."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -67,12 +72,10 @@ class Found:
         """The transform (4, 4) to give."""
         return self.answers[0].transformation
 
-    @property
+    @cached_property
     def evidence(self) -> Evidence:
         """What speaks for the best answer."""
-        best, second = self.answers[0], max((answer.score for answer in self.answers[1:]), default=0.0)
-        margin = max(0.0, 1.0 - second / best.score) if best.score > 0 else 0.0
-        return Evidence(best.overlap, best.support, best.likelihood, margin)
+        return evidence(self.answers)
 
     @property
     def weights(self) -> Array:
@@ -141,6 +144,8 @@ def choose(
 def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fine: Surfaces) -> Found:
     """What the likeliest of the candidates (S, 4, 4) come to: refined, scored and looked at closely."""
     tried = likeliest(candidates[distinct(candidates, HYPOTHESES)], matching, EXAMINED)
+    if scope.given:
+        tried = np.concatenate([homed(scope.guess, matching)[None], tried])
     answers = ranked(improve(tried, matching, reaches(method)[0], method))
     mistaken = scope.within(slides(matching.clouds.surfaces, answers[0].transformation))
     if len(mistaken):
@@ -148,6 +153,13 @@ def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fi
         answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
     return Found(least_turned(judged(answers[:CONTENDERS], matching, method, fine), scope.guess), matching)
+
+
+def homed(guess: Array, matching: Matching) -> Array:
+    """A guess (4, 4) drawn near from farther away than candidates are, which are nearly right or wrong altogether."""
+    for reach in HOMING:
+        guess = align(matching.clouds.surfaces, guess, reach, "gicp")
+    return guess
 
 
 def judged(answers: list[Answer], matching: Matching, method: str, fine: Surfaces) -> list[Answer]:
@@ -158,7 +170,7 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
     contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
     contenders = [verified(answer, matching, fine, method) for answer in contenders]
     rest = answers[len(contenders) :]
-    return first_of_its_kind([*sorted(contenders, key=lambda answer: -answer.score), *rest])
+    return first_of_its_kind([*sorted(contenders, key=lambda answer: -weight(answer)), *rest])
 
 
 def to_match(clouds: Pyramid) -> Iterator[tuple[PairLevel, int]]:
@@ -174,10 +186,10 @@ def first_of_its_kind(answers: list[Answer]) -> list[Answer]:
 
 
 def least_turned(answers: list[Answer], guess: Array) -> list[Answer]:
-    """The answers, first the one nearest to the guess of those that explain the clouds as well as the best.
+    """The answers, first the one nearest to the guess of those that are as likely to be right as the best.
 
     Something has to choose among the poses of a symmetric object, and scans stand upright more often than not.
     """
-    tied = [answer for answer in answers if answer.score >= (1 - CLOSE) * answers[0].score]
+    tied = [answer for answer in answers if weight(answer) >= weight(answers[0]) - TIED]
     first = min(tied, key=lambda answer: float(rigid.angle(guess[:3, :3].T @ answer.transformation[:3, :3])))
     return [first, *(answer for answer in answers if answer is not first)]

@@ -75,6 +75,13 @@ def test_an_unknown_setting_is_refused_with_the_known_ones(setting, monkeypatch)
         build_method("icp", None, [setting])
 
 
+@pytest.mark.parametrize(("name", "setting"), [("icp", "fgr_distance=1"), ("fgr", "ransac_distance=1")])
+def test_settings_of_other_methods_are_refused(name, setting, monkeypatch):
+    monkeypatch.setattr(classical, "open3d", lambda: None)
+    with pytest.raises(InputError, match=f"unknown setting '{setting}'"):
+        build_method(name, None, [setting])
+
+
 MISSING = {"icp": "open3d", "fgr": "open3d", "fpfh-ransac": "open3d", "kiss-matcher": "kiss_matcher"}
 
 

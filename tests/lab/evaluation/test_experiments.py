@@ -1,6 +1,7 @@
 """Test pairs, and anyone's own pairs."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -135,10 +136,124 @@ def test_pairs_are_read_as_they_were_saved(number, savez, save, tmp_path):
     savez(tmp_path / "again.npz", **arrays)
     pairs = read_pairs(str(tmp_path / "again.npz")).pairs
     assert len(pairs) == 2
-    for key, field in zip(("source", "target", "R", "t"), dataclasses.fields(Pairs), strict=True):
-        read = getattr(pairs, field.name)
-        assert read.dtype == torch.float32
-        np.testing.assert_array_equal(read.numpy(), arrays[key].astype(np.float32))
+    for n in range(2):
+        for key, read in (("source", pairs.source[n]), ("target", pairs.target[n])):
+            assert read.dtype == torch.float32
+            np.testing.assert_array_equal(read.numpy(), arrays[key][n].astype(np.float32))
+    np.testing.assert_array_equal(pairs.rotation.numpy(), arrays["R"].astype(np.float64))
+    np.testing.assert_allclose(pairs.translation.numpy(), arrays["t"], rtol=1e-12)
+
+
+def in_object_array(clouds: list[np.ndarray]) -> np.ndarray:
+    array = np.empty(len(clouds), object)
+    array[:] = clouds
+    return array
+
+
+def test_pairs_of_unequal_size_are_read_from_object_arrays(save):
+    rng = np.random.default_rng(1)
+    source, target = ([rng.standard_normal((size, 3)) for size in sizes] for sizes in ((5, 9), (7, 4)))
+    path = save(source=in_object_array(source), target=in_object_array(target))
+    pairs = read_pairs(path).pairs
+    for clouds, read in ((source, pairs.source), (target, pairs.target)):
+        for cloud, tensor in zip(clouds, read, strict=True):
+            np.testing.assert_array_equal(tensor.numpy(), cloud.astype(np.float32))
+
+
+class RunsCode:
+    def __reduce__(self):
+        return Path.touch, (Path("touched"),)
+
+
+def test_an_object_array_that_would_run_code_is_refused(save, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="not arrays alone"):
+        read_pairs(save(source=in_object_array([RunsCode(), RunsCode()])))
+    assert not Path("touched").exists()
+
+
+@pytest.fixture
+def surveyed(generator) -> dict[str, np.ndarray]:
+    """Two copies of a cloud 20 m wide in UTM coordinates, rotated about the origin of these."""
+    rng = np.random.default_rng(2)
+    source = rng.uniform(-10, 10, (2, 30, 3)) + np.array([448_262.0, 5_411_932.0, 112.0])
+    rotation = random_rotation(2, generator=generator, dtype=torch.float64).numpy()
+    translation = rng.uniform(-1, 1, (2, 3)) * 1e6
+    target = np.einsum("nij,npj->npi", rotation, source) + translation[:, None]
+    return {"source": source, "target": target, "R": rotation, "t": translation}
+
+
+def test_clouds_far_off_the_origin_lose_no_digits(save, surveyed):
+    pairs = read_pairs(save(**surveyed)).pairs
+    for n in range(2):
+        moved = pairs.source[n].double() @ pairs.rotation[n].T + pairs.translation[n]
+        assert (moved - pairs.target[n].double()).abs().max() < 1e-5
+        shape = surveyed["source"][n] - surveyed["source"][n].mean(0)
+        np.testing.assert_allclose(pairs.source[n].numpy(), shape, atol=1e-5)
+
+
+@pytest.fixture
+def listed(tmp_path, surveyed) -> Callable[..., Path]:
+    """Writes two pairs of unequal clouds as files and a JSON list of them, with changes to the first record."""
+
+    def write(success: Any = None, bare: bool = False, **changes: Any) -> Path:
+        records = []
+        for n in range(2):
+            truth = np.eye(4)
+            truth[:3, :3], truth[:3, 3] = surveyed["R"][n], surveyed["t"][n]
+            for side, count in (("source", 30 - n), ("target", 20 + n)):
+                np.save(tmp_path / f"{side}{n}.npy", surveyed[side][n, :count])
+            records.append({"source": f"source{n}.npy", "target": f"target{n}.npy", "transformation": truth.tolist()})
+        records[0] |= changes
+        content = records if bare else {"pairs": records, **({"success": success} if success else {})}
+        (tmp_path / "pairs.json").write_text(json.dumps(content))
+        return tmp_path / "pairs.json"
+
+    return write
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_list_of_files_is_read_with_every_cloud_about_its_centroid(bare, listed, surveyed):
+    test = read_pairs(listed(bare=bare))
+    assert [len(cloud) for cloud in test.pairs.source] == [30, 29]
+    assert [len(cloud) for cloud in test.pairs.target] == [20, 21]
+    assert test.within == (5.0, 0.05)
+    for n in range(2):
+        assert test.pairs.source[n].mean(0).abs().max() < 1e-5
+        moved = test.pairs.source[n].double() @ test.pairs.rotation[n].T + test.pairs.translation[n]
+        assert (moved[: len(test.pairs.target[n])][:20] - test.pairs.target[n].double()[:20]).abs().max() < 1e-5
+
+
+def test_bounds_are_the_caller_s_or_the_file_s(listed):
+    path = listed(success={"rotation_deg": 2, "centroid_shift": 0.3})
+    assert read_pairs(path).within == (2, 0.3)
+    assert read_pairs(path, (1.0, 0.1)).within == (1, 0.1)
+    for bad in ((0.0, 1.0), (1.0, float("nan"))):
+        with pytest.raises(InputError, match="positive"):
+            read_pairs(path, bad)
+
+
+BAD_LISTS = {
+    "no transformation": ({"transformation": None}, "transformation of pair 1"),
+    "a reflection": ({"transformation": np.diag([1, 1, -1, 1]).tolist()}, "transformation of pair 1: it mirrors"),
+    "a missing file": ({"source": "nowhere.ply"}, r"nowhere\.ply"),
+    "no name": ({"source": 3}, "3"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_LISTS.values(), ids=BAD_LISTS)
+def test_lists_of_another_form_are_refused_in_one_line(changes, message, listed):
+    with pytest.raises(InputError, match=message) as caught:
+        read_pairs(listed(**changes))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"pairs": 3}', '[{"source": "a.ply"}]', "[1]", "null"])
+def test_json_that_lists_no_pairs_is_refused_in_one_line(text, tmp_path):
+    (tmp_path / "pairs.json").write_text(text)
+    with pytest.raises(InputError, match=r"pairs\.json: (is no list of pairs|lists no pairs)") as caught:
+        read_pairs(tmp_path / "pairs.json")
+    assert "\n" not in str(caught.value)
 
 
 BAD_ARRAYS = {

@@ -73,7 +73,7 @@ def test_the_weights_are_read_once_and_not_for_every_pair(weights, clouds):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_without_a_model_the_network_has_the_weights_for_unseen_shapes(name, monkeypatch):
     asked = []
-    monkeypatch.setattr(network, "load_model", lambda model: (asked.append(model), IDAM(Config()))[1])
+    monkeypatch.setattr(network, "load_model", lambda model: (asked.append(model), IDAM(Config(NETWORKS[name])))[1])
     build_method(name)
     build_method(name, "another")
     assert asked == [f"{NETWORKS[name]}-unseen-shapes", "another"]
@@ -117,6 +117,18 @@ def test_the_paper_s_inference_is_a_row_whatever_the_model_s_own(tmp_path, seaso
     paper = Config(neighbours=5, channels=8)
     assert used[0].config == paper
     assert (paper.iterations, paper.keep, paper.keep_again, paper.soft_matches) == (3, 1 / 6, (), False)
+
+
+@pytest.mark.parametrize("setting", ["convolution=false", "neighbours=5", "features=fpfh", "channels=8"])
+def test_settings_that_would_change_nothing_of_a_trained_network_are_refused(setting, weights):
+    with pytest.raises(InputError, match=f"'{setting}': give NAME=VALUE with one of iterations, keep"):
+        build_method("gnn-idam", weights, [setting])
+
+
+@pytest.mark.parametrize(("name", "model"), [("gnn-idam", "fpfh-unseen-shapes"), ("fpfh-idam", "gnn-unseen-shapes")])
+def test_a_model_of_other_features_is_refused(name, model):
+    with pytest.raises(InputError, match=rf"{model} has \w+ features.*--model.*--method register"):
+        build_method(name, model)
 
 
 def test_the_register_row_takes_no_other_settings():

@@ -79,6 +79,13 @@ def test_known_shapes_are_measured_with_and_without_axes_and_by_their_surface(pa
     assert row.chamfer == pytest.approx(modified_chamfer(pairs, whole, *nothing), rel=1e-6)
 
 
+def test_symmetric_poses_are_counted_on_pairs_of_practice_alone(pairs, given, monkeypatch, randn):
+    monkeypatch.setattr(runner, "right_up_to_symmetry", lambda *_: torch.tensor([True, False, True, True, True]))
+    whole, labels = randn(5, 40, 3, dtype=torch.float32), torch.zeros(5)
+    for name, expected in (("practice", 0.8), ("practice-any-rotation", 0.8), ("unseen-shapes", None)):
+        assert run(given(identity), TestSet(name, pairs, "1", labels, whole), ignore).symmetric_recall == expected
+
+
 def test_pairs_of_unknown_shapes_are_not(test, given):
     row = run(given(identity), test, ignore)
     assert row.observable is None
@@ -120,7 +127,7 @@ def test_what_would_run_for_days_takes_the_first_pairs_alone(test, given, monkey
 
 @pytest.mark.parametrize("jobs", [2, 9])
 def test_several_processes_find_what_one_does(jobs, test, one_thread):
-    task = Task("gnn-idam", "gnn-unseen-shapes", ("keep=0.9", "neighbours=12"))
+    task = Task("gnn-idam", "gnn-unseen-shapes", ("keep=0.9", "iterations=3"))
     advanced = []
     shared = run(task, test, lambda: advanced.append(1), jobs)
     alone = run(task, test, ignore)
@@ -136,7 +143,7 @@ def test_a_method_that_cannot_be_built_is_refused_before_any_process_starts(test
 METRICS = Metrics(rmse_r=1.0, mae_r=2.0, rmse_t=3.0, mae_t=4.0, recall=0.5, angle=6.0, distance=7.0)
 ROWS = {
     "plain": Row(Task("icp"), 7, METRICS, 0.1),
-    "full": Row(Task("gnn-idam", "a model", ("keep=1",)), 7, METRICS, 0.1, METRICS, 0.25),
+    "full": Row(Task("gnn-idam", "a model", ("keep=1",)), 7, METRICS, 0.1, METRICS, 0.25, 0.75),
 }
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from idam.errors import InputError, MissingDependencyError
 from idam.io import check_destination
 from idam.lab.evaluation.experiments import TestSet
-from idam.lab.evaluation.methods import has_weights, rows_of
-from idam.lab.evaluation.methods.network import weights_for
+from idam.lab.evaluation.methods import ABLATION, has_weights, rows_of
+from idam.lab.evaluation.methods.network import find_ablation_weights, weights_for
 from idam.lab.evaluation.record import Missing, read_rows, write_record
 from idam.lab.evaluation.runner import LIMITS, Row, Task, run
 from idam.lab.evaluation.table import Board
@@ -33,7 +33,8 @@ def evaluate(
     Args:
         test: the pairs.
         methods: names of the rows; None for all of the table, of which those that cannot run here say why instead.
-        model: weights for the rows that take any; None for those that were trained for the experiment.
+        model: weights for the rows that take any, or the folder of the ablation's; None for those trained for the
+            experiment.
         settings: of the one method asked for.
         jobs: processes that share the pairs.
         output: JSON file, written after each row.
@@ -46,6 +47,8 @@ def evaluate(
     """
     if settings and len(methods or ()) != 1:
         raise InputError("settings are of one method: give --set with one --method")
+    if model is not None and methods and not any(map(has_weights, methods)):
+        raise InputError(f"{', '.join(methods)} takes no weights: leave --model out")
     if resume and output is None:
         raise InputError("give --resume with --json, the file to go on with")
     tasks = [Task(name, _weights(name, model, test.name), tuple(settings)) for name in methods or rows_of(test.name)]
@@ -65,7 +68,9 @@ def evaluate(
 
 
 def _weights(method: str, model: str | None, experiment: str) -> str | None:
-    """The weights of a row: those named go to every row that takes any."""
+    """The weights of a row: those named go to every row that takes any; the ablation's are in a folder."""
+    if method in ABLATION:
+        return find_ablation_weights(method, model)
     if model is not None:
         return model if has_weights(method) else None
     return weights_for(method, experiment)

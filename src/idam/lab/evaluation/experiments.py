@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +12,10 @@ from torch import Tensor
 
 from idam.errors import InputError
 from idam.lab.data.modelnet40 import experiment_shapes
+from idam.lab.data.own_pairs import LocatedPairs, read_own_pairs
 from idam.lab.data.pairs import EXPERIMENTS, Pairs, experiment_noise, fixed_pairs
 from idam.lab.data.practice import fixed_practice_pairs
+from idam.lab.evaluation.metrics import WITHIN
 
 __all__ = ["AXISYMMETRIC", "TABLES", "TEST_SEED", "TestSet", "read_pairs", "test_set"]
 
@@ -22,7 +23,7 @@ TEST_SEED = 1
 """Of the test pairs: with the index, all that they depend on."""
 
 TABLES = (*EXPERIMENTS, "ablation", "practice", "practice-any-rotation")
-"""The paper's experiments, its ablation, and disjoint halves (:mod:`idam.lab.data.practice`), small or any rotation."""
+"""The paper's experiments, ablation, and disjoint halves (:mod:`idam.lab.data.practice`) of any rotation or less."""
 
 AXISYMMETRIC = (5, 6, 9, 10, 15, 19, 34, 37)
 """Labels of bottle, bowl, cone, cup, flower_pot, lamp, tent and vase, whose turn about their axis no one can see."""
@@ -38,15 +39,17 @@ class TestSet:
         checksum: of what they were drawn from, the same on every machine.
         labels: of the shapes (n,), where they are ModelNet40's.
         whole: the shapes without noise and cropping, in the source's frame (n, 1024, 3), where they are known.
+        within: degrees and distance up to which an answer counts as right.
     """
 
     __test__ = False  # not a test of pytest's
 
     name: str
-    pairs: Pairs
+    pairs: Pairs | LocatedPairs
     checksum: str
     labels: Tensor | None = None
     whole: Tensor | None = None
+    within: tuple[float, float] = WITHIN
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -54,7 +57,7 @@ class TestSet:
     def first(self, count: int) -> TestSet:
         """The first pairs alone."""
         labels, whole = (None if part is None else part[:count] for part in (self.labels, self.whole))
-        return TestSet(self.name, self.pairs[:count], self.checksum, labels, whole)
+        return TestSet(self.name, self.pairs[:count], self.checksum, labels, whole, self.within)
 
     @property
     def observable(self) -> Tensor | None:
@@ -89,37 +92,19 @@ def _checksum(*tensors: Tensor) -> str:
     return digest.hexdigest()[:16]
 
 
-def read_pairs(path: str | Path) -> TestSet:
-    """Pairs from an ``.npz`` with ``source`` (n, P, 3), ``target`` (n, Q, 3), ``R`` (n, 3, 3) and ``t`` (n, 3).
+def read_pairs(path: str | Path, within: tuple[float, float] | None = None) -> TestSet:
+    """Pairs of one's own (:func:`idam.lab.data.own_pairs.read_own_pairs`).
+
+    Args:
+        path: the file.
+        within: degrees and distance up to which an answer counts as right; None for the file's, or 5 and 0.05.
 
     Raises:
-        InputError: the file is missing, or not of that form.
+        InputError: the file is missing or not of its form, or the bounds are none.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give an .npz of pairs")
-    try:
-        # NumPy does not close a file that it opened and found to be broken
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file, np.errstate(over="ignore"):
-            arrays = [np.asarray(file[key], np.float32) for key in ("source", "target", "R", "t")]
-    except KeyError as error:
-        raise InputError(f"{path}: {error.args[0]}; it needs the arrays source, target, R and t") from None
-    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as .npz ({error})") from None
-    source, target, rotation, _ = arrays
-    count = len(source) if source.ndim == 3 else -1
-    expected = [(count, source.shape[1] if source.ndim == 3 else 0, 3), (count, -1, 3), (count, 3, 3), (count, 3)]
-    for name, array, shape in zip(("source", "target", "R", "t"), arrays, expected, strict=True):
-        fits = len(array.shape) == len(shape) and all(b in (-1, a) for a, b in zip(array.shape, shape, strict=True))
-        if not fits or count < 1:
-            raise InputError(
-                f"{path}: {name} has shape {array.shape}; needed are (n, P, 3), (n, Q, 3), (n, 3, 3), (n, 3)"
-            )
-        if not np.isfinite(array).all():
-            raise InputError(f"{path}: {name} holds NaN or infinite numbers")
-    if min(source.shape[1], target.shape[1]) < 3:
-        raise InputError(f"{path}: a pair needs 3 points of each cloud or more; give larger clouds")
-    if np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation).min() < 0:
-        raise InputError(f"{path}: R holds matrices that are no rotations; needed are orthogonal ones, determinant 1")
-    tensors = [torch.from_numpy(array) for array in arrays]
-    return TestSet(str(path), Pairs(*tensors), _checksum(*tensors))
+    if within is not None and not (within[0] > 0 and within[1] > 0):
+        raise InputError(f"cannot count answers within {within[0]:g} degrees and {within[1]:g}: both must be positive")
+    own = read_own_pairs(path)
+    pairs = own.located()
+    checksum = _checksum(*pairs.source, *pairs.target, pairs.rotation, pairs.translation)
+    return TestSet(str(path), pairs, checksum, within=within or own.within or WITHIN)

@@ -13,10 +13,11 @@ from torch import Tensor
 from idam.lab.data.pairs import Pairs
 from idam.network.geometry import apply_transform, nearest, rotation_angle, rotation_to_euler_zyx
 
-__all__ = ["Metrics", "measure", "modified_chamfer", "motion_error"]
+__all__ = ["WITHIN", "Metrics", "measure", "modified_chamfer", "motion_error"]
 
-RECALL_ANGLE = 5.0
-RECALL_DISTANCE = 0.05
+WITHIN = (5.0, 0.05)
+"""Degrees and distance up to which a pair counts as right."""
+
 CHUNK = 64
 """Pairs whose distance matrices are in memory at a time."""
 
@@ -30,7 +31,7 @@ class Metrics:
         mae_r: mean absolute error of the zyx Euler angles, degrees.
         rmse_t: root mean square error of the translation's coordinates.
         mae_t: mean absolute error of the translation's coordinates.
-        recall: share of pairs within 5 degrees and 0.05.
+        recall: share of pairs whose errors are within bounds, 5 degrees and 0.05 unless others are given.
         angle: mean angle of R* R^T, degrees.
         distance: mean of |t - t*|.
     """
@@ -57,7 +58,13 @@ def motion_error(
     return float(degrees), float(np.linalg.norm(apart))
 
 
-def measure(rotation: Tensor, translation: Tensor, true_rotation: Tensor, true_translation: Tensor) -> Metrics:
+def measure(
+    rotation: Tensor,
+    translation: Tensor,
+    true_rotation: Tensor,
+    true_translation: Tensor,
+    within: tuple[float, float] = WITHIN,
+) -> Metrics:
     """Compare n transforms, rotations (n, 3, 3) and translations (n, 3), with the truth.
 
     RMSE and MAE are over all 3 n Euler angles (differences wrapped to +-180 degrees) and all 3 n coordinates; recall
@@ -68,7 +75,7 @@ def measure(rotation: Tensor, translation: Tensor, true_rotation: Tensor, true_t
     angles = (angles + 180.0).remainder(360.0) - 180.0
     offset = translation.double() - true_translation.double()
     turn = rotation_angle(true_rotation @ rotation.transpose(-1, -2))
-    right = (turn <= RECALL_ANGLE) & (offset.norm(dim=-1) <= RECALL_DISTANCE)
+    right = (turn <= within[0]) & (offset.norm(dim=-1) <= within[1])
     return Metrics(
         rmse_r=float(angles.square().mean().sqrt()),
         mae_r=float(angles.abs().mean()),

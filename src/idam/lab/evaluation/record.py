@@ -16,6 +16,7 @@ from idam import __version__
 from idam.errors import InputError
 from idam.io import write_json
 from idam.lab.evaluation.experiments import TEST_SEED, TestSet
+from idam.lab.evaluation.metrics import WITHIN
 from idam.lab.evaluation.runner import Row, Task
 
 __all__ = ["Missing", "read_rows", "write_record"]
@@ -45,6 +46,7 @@ def write_record(path: Path, test: TestSet, rows: list[Row | Missing], command: 
         {
             "pairs_from": test.name,
             "checksum": test.checksum,
+            "recall_within": list(test.within),
             "seed": TEST_SEED,
             "command": command,
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -73,13 +75,15 @@ def read_rows(path: Path, test: TestSet) -> list[Row]:
     try:
         record: dict[str, Any] = json.loads(path.read_text())
         rows = [Row.from_dict(row) for row in record["rows"] if "missing" not in row]
-        checksum = record["checksum"]
+        checksum, within = record["checksum"], record.get("recall_within", list(WITHIN))
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(
             f"{path}: holds no evaluation to go on with; name another --json, or leave --resume out"
         ) from None
-    if checksum != test.checksum:
-        raise InputError(f"{path}: is an evaluation of other pairs; name another --json, or leave --resume out")
+    if (checksum, within) != (test.checksum, list(test.within)):
+        raise InputError(
+            f"{path}: is an evaluation of other pairs or bounds; name another --json, or leave --resume out"
+        )
     return rows
 
 

@@ -15,9 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from idam.lab.data.pairs import Pairs
 from idam.lab.evaluation.experiments import TestSet
 from idam.lab.evaluation.methods import Method, build_method
 from idam.lab.evaluation.metrics import Metrics, measure, modified_chamfer
+from idam.lab.evaluation.symmetry import right_up_to_symmetry
 
 __all__ = ["LIMITS", "Row", "Task", "run"]
 
@@ -49,6 +51,7 @@ class Row:
         seconds_per_pair: median wall-clock time.
         observable: its errors on the shapes without an axis of symmetry, where the shapes are known.
         chamfer: mean modified Chamfer distance, where the shapes are known.
+        symmetric_recall: recall that counts the poses of symmetric shapes that look the same, on pairs of practice.
     """
 
     task: Task
@@ -57,6 +60,7 @@ class Row:
     seconds_per_pair: float
     observable: Metrics | None = None
     chamfer: float | None = None
+    symmetric_recall: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """One flat record, for JSON; without what is not known."""
@@ -72,6 +76,8 @@ class Row:
             known |= {f"observable_{name}": value for name, value in self.observable.to_dict().items()}
         if self.chamfer is not None:
             known["chamfer"] = self.chamfer
+        if self.symmetric_recall is not None:
+            known["symmetric_recall"] = self.symmetric_recall
         return known
 
     @staticmethod
@@ -86,6 +92,7 @@ class Row:
             float(record["seconds_per_pair"]),
             Metrics(**{name: float(record[f"observable_{name}"]) for name in names}) if seen else None,
             record.get("chamfer"),
+            record.get("symmetric_recall"),
         )
 
 
@@ -102,7 +109,8 @@ def run(task: Task, test: TestSet, advance: Callable[[], None], jobs: int = 1) -
         InputError, MissingDependencyError: the method cannot be built, or cannot take these pairs.
     """
     test = test.first(LIMITS.get(task.method, len(test)))
-    clouds = list(zip(test.pairs.source.numpy(), test.pairs.target.numpy(), strict=True))
+    sources, targets = ([cloud.numpy() for cloud in side] for side in (test.pairs.source, test.pairs.target))
+    clouds = list(zip(sources, targets, strict=True))
     estimates, seconds = [], []
     with _registering(task, min(jobs, len(clouds))) as register:
         for estimate, duration in register(clouds):
@@ -114,18 +122,17 @@ def run(task: Task, test: TestSet, advance: Callable[[], None], jobs: int = 1) -
 
 
 def _measured(task: Task, test: TestSet, rotation: torch.Tensor, translation: torch.Tensor, seconds: float) -> Row:
-    truth = test.pairs.rotation, test.pairs.translation
+    found, truth = (rotation, translation), (test.pairs.rotation, test.pairs.translation)
     seen = test.observable
-    return Row(
-        task,
-        len(test),
-        measure(rotation, translation, *truth),
-        seconds,
-        None
-        if seen is None or not seen.any()
-        else measure(rotation[seen], translation[seen], *(part[seen] for part in truth)),
-        None if test.whole is None else modified_chamfer(test.pairs, test.whole, rotation, translation),
-    )
+    observable = chamfer = symmetric = None
+    if seen is not None and seen.any():
+        observable = measure(rotation[seen], translation[seen], truth[0][seen], truth[1][seen], test.within)
+    if test.whole is not None and isinstance(test.pairs, Pairs):
+        chamfer = modified_chamfer(test.pairs, test.whole, *found)
+    if test.whole is not None and test.name.startswith("practice"):
+        symmetric = float(right_up_to_symmetry(test.whole, found, truth, test.within).double().mean())
+    metrics = measure(*found, *truth, test.within)
+    return Row(task, len(test), metrics, seconds, observable, chamfer, symmetric)
 
 
 Clouds = tuple[NDArray[np.float32], NDArray[np.float32]]

@@ -9,11 +9,12 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from idam.lab.evaluation.methods import METHODS
 from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.record import Missing
 from idam.lab.evaluation.runner import Row
 
-__all__ = ["Board", "columns", "results_table"]
+__all__ = ["Board", "columns", "order", "results_table", "short_name"]
 
 WIDTH = 130
 """Columns of a table that is not printed to a terminal."""
@@ -47,15 +48,26 @@ def results_table(experiment: str, rows: list[Row | Missing]) -> Table:
     return table
 
 
+def order(method: str) -> float:
+    """Where a method stands in a table: those of one's own, such as the rivals, before the networks of this package."""
+    rows, name = list(METHODS), short_name(method)
+    return rows.index(name) if name in METHODS else rows.index("fpfh-idam-paper") - 0.5
+
+
+def short_name(method: str) -> str:
+    """A method of one's own by its function, the others as they are."""
+    return method.rpartition(":")[2]
+
+
 def _name(row: Row) -> str:
     settings = f" [{', '.join(row.task.settings)}]" if row.task.settings else ""
-    return row.task.method + (f" ({row.task.model})" if row.task.model else "") + settings
+    return short_name(row.task.method) + (f" ({row.task.model})" if row.task.model else "") + settings
 
 
 def _paper_columns(experiment: str) -> dict[str, Cell]:
     def beside(row: Row, place: int, text: str) -> str:
         # a method's other settings stand beside the same figures
-        name = row.task.method.removesuffix("-tuned").removesuffix("-paper")
+        name = short_name(row.task.method).removesuffix("-tuned").removesuffix("-paper")
         reported = PAPER.get(experiment, {}).get(name)
         return text if reported is None else f"{text} ({reported[place]:g})"
 
@@ -71,6 +83,7 @@ def _paper_columns(experiment: str) -> dict[str, Cell]:
 def _practice_columns() -> dict[str, Cell]:
     return {
         "recall": lambda row: f"{row.metrics.recall:.3f}",
+        "with symmetric poses": lambda row: "" if row.symmetric_recall is None else f"{row.symmetric_recall:.3f}",
         "without axisymmetric": lambda row: "" if row.observable is None else f"{row.observable.recall:.3f}",
         "angle": lambda row: f"{row.metrics.angle:.2f}",
         "distance": lambda row: f"{row.metrics.distance:.4f}",

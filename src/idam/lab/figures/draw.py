@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from idam.io import make_folder
 from idam.lab.data.modelnet40 import Shapes, experiment_shapes
-from idam.lab.evaluation.experiments import test_set
+from idam.lab.data.pairs import experiment_noise, fixed_pairs
+from idam.lab.evaluation.experiments import TEST_SEED
 from idam.lab.figures.categories import category_names, one_of_each, spread, up_axis
 from idam.lab.figures.curves import calibrate, observe
 from idam.lab.figures.scenes import Scan, first_matches, kept_points, lay, read_scans
@@ -94,7 +95,7 @@ def _with_noise(data: Path, shapes: Shapes, network: IDAM, observed: IDAM, tell:
     from idam.lab.figures.plot_scenes import draw_overlays
 
     tell("registrations")
-    pairs = test_set("gaussian-noise", data).pairs
+    pairs = fixed_pairs(shapes.points, TEST_SEED, experiment_noise("gaussian-noise"))
     chosen, up = _choose(shapes, REGISTERED, data), up_axis(shapes)
     overlays = [lay(network, (name, pairs.source[n], pairs.target[n]), pairs.rotation[n].T) for n, name in chosen]
     yield "registrations", draw_overlays(overlays, up)
@@ -112,7 +113,7 @@ def _without_noise(data: Path, shapes: Shapes, network: IDAM, tell: Tell) -> Dra
 
     tell("keypoints")
     network.config = replace(network.config, keep=PAPERS_KEEP, keep_again=())
-    pairs = test_set("unseen-shapes", data).pairs
+    pairs = fixed_pairs(shapes.points, TEST_SEED)
     chosen, up = _choose(shapes, DESCRIBED, data), up_axis(shapes)
     yield "keypoints", draw_key_points([kept_points(network, name, pairs[n : n + 1]) for n, name in chosen], up)
     tell("correspondences")

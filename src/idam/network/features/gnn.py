@@ -24,25 +24,36 @@ from idam.describe.neighbours import nearest_neighbours as nearest_by_tree
 from idam.network.geometry import nearest_neighbours
 from idam.network.layers import NormalisedLinear
 
-__all__ = ["GNN", "EdgeLayer", "neighbour_graph"]
+__all__ = ["GNN", "EdgeLayer", "neighbour_graph", "neighbours_of"]
 
 POINTS_IN_CACHE = 256
 """Points whose edges go through a layer at once in evaluation: their features, 0.8 MB, stay near the core."""
 
 
 def neighbour_graph(points: Tensor, k: int) -> Tensor:
-    """The k nearest neighbours of every point of a batch of clouds (B, N, 3), by a tree or, on a GPU, by all distances.
+    """The k nearest neighbours of every point of a batch of clouds (B, N, 3), as edge layers take them.
 
     Returns:
         (k, P): rows of the flattened batch of P = B N points; each cloud is on its own.
     """
-    batch, count, _ = points.shape
-    offset = torch.arange(batch, device=points.device).view(-1, 1, 1) * count
+    return _flattened(neighbours_of(points, k))
+
+
+def neighbours_of(points: Tensor, k: int) -> Tensor:
+    """The k nearest others of every point of a batch of clouds (B, N, 3), by rows of each cloud: (B, N, k).
+
+    By a tree or, on a GPU, by all distances, which stays there. A rigid motion leaves them as they are.
+    """
     if points.is_cuda:
-        near = nearest_neighbours(points, k)
-    else:
-        clouds = points.detach().double().numpy()
-        near = torch.from_numpy(np.stack([nearest_by_tree(cloud, k)[1] for cloud in clouds]))
+        return nearest_neighbours(points, k)
+    clouds = points.detach().double().numpy()
+    return torch.from_numpy(np.stack([nearest_by_tree(cloud, k)[1] for cloud in clouds]))
+
+
+def _flattened(near: Tensor) -> Tensor:
+    """Neighbours (B, N, k) by rows of each cloud as rows (k, B N) of the flattened batch."""
+    batch, count, k = near.shape
+    offset = torch.arange(batch, device=near.device).view(-1, 1, 1) * count
     return (near + offset).view(-1, k).t().contiguous()
 
 
@@ -89,12 +100,16 @@ class _NeighbourMaximum(torch.autograd.Function):
 
 def neighbour_difference(centre: Tensor, h: Tensor, neighbours: Tensor) -> Tensor:
     """centre_i - h_j for every edge, (K, P, C), of (P, C) and (Q, C), whose rows the neighbours (K, P) are."""
+    if not h.requires_grad:  # the same, of plain operations, which can be traced and exported
+        return centre - F.embedding(neighbours, h)
     difference: Tensor = _NeighbourDifference.apply(centre, h, neighbours)  # type: ignore[no-untyped-call] # torch's own
     return difference
 
 
 def neighbour_maximum(y: Tensor) -> Tensor:
     """The maximum over neighbours: (K, P, C) -> (P, C)."""
+    if not y.requires_grad:
+        return y.amax(0)
     maximum: Tensor = _NeighbourMaximum.apply(y)  # type: ignore[no-untyped-call] # torch's own
     return maximum
 
@@ -138,19 +153,33 @@ class GNN(nn.Module):
         self.neighbours = neighbours
         self.layers = nn.ModuleList(EdgeLayer(3 if n == 0 else self.channels, self.channels) for n in range(layers))
 
-    def forward(self, points: Tensor) -> Tensor:
-        """Features (B, N, 64) of points (B, N, 3), N > ``neighbours``; translation invariant, not rotation invariant.
+    def graph(self, points: Tensor) -> Tensor:
+        """Neighbours (B, N, K) of points (B, N, 3), N > K, by rows of each cloud.
 
         Raises:
             ValueError: the clouds have too few points for the graph.
         """
         if points.shape[1] <= self.neighbours:
             raise ValueError(f"a cloud of {points.shape[1]} points is too small: the GNN needs {self.neighbours + 1}")
+        centred = points - points.mean(1, keepdim=True)
+        return neighbours_of(centred.detach(), self.neighbours)
+
+    def forward(self, points: Tensor, neighbours: Tensor | None = None) -> Tensor:
+        """Features (B, N, 64) of points (B, N, 3), N > K; translation invariant, not rotation invariant.
+
+        Args:
+            points: (B, N, 3).
+            neighbours: rows of the K nearest others of each point, (B, N, K), where they are known: then nothing is
+                searched, and what is left can be traced and exported. None to search, by :meth:`graph`.
+
+        Raises:
+            ValueError: the clouds have too few points for the graph.
+        """
         # neighbours and differences of coordinates need full precision also under autocast
         with torch.autocast(points.device.type, enabled=False):
             centred = points - points.mean(1, keepdim=True)
-            neighbours = neighbour_graph(centred.detach(), self.neighbours)
+            near = _flattened(self.graph(points) if neighbours is None else neighbours)
         u = centred.flatten(0, 1)
         for layer in self.layers:
-            u = layer(u, neighbours)
+            u = layer(u, near)
         return u.view(*points.shape[:2], -1)

@@ -46,19 +46,26 @@ class Settings:
     icp_after: float = 0.0
 
 
+ICP = ("icp_distance", "icp_iterations")
+FPFH = ("normal_radius", "feature_radius", "icp_after", "icp_iterations")
+FGR = (*FPFH, "fgr_distance", "fgr_anneal")
+RANSAC = (*FPFH, "ransac_distance", "ransac_iterations", "ransac_edges")
+"""Settings that each method uses; the others are refused, rather than ignored."""
+
+
 def icp(model: str | None, settings: Sequence[str]) -> Method:
     """Point-to-point ICP from the identity."""
-    return _method(_icp, settings)
+    return _method(_icp, settings, ICP)
 
 
 def fgr(model: str | None, settings: Sequence[str]) -> Method:
     """Fast global registration on FPFH matches (Zhou et al., ECCV 2016)."""
-    return _method(_fgr, settings)
+    return _method(_fgr, settings, FGR)
 
 
 def ransac(model: str | None, settings: Sequence[str]) -> Method:
     """RANSAC over mutual FPFH matches."""
-    return _method(_ransac, settings)
+    return _method(_ransac, settings, RANSAC)
 
 
 def open3d() -> Any:
@@ -76,8 +83,8 @@ def open3d() -> Any:
         ) from None
 
 
-def _method(register: Callable[..., Any], texts: Sequence[str]) -> Method:
-    settings, o3d = with_settings(Settings(), texts), open3d()
+def _method(register: Callable[..., Any], texts: Sequence[str], used: Sequence[str]) -> Method:
+    settings, o3d = with_settings(Settings(), texts, used), open3d()
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
 
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,22 +14,38 @@ from torch import nn
 from idam.align import align, reaches
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.errors import InputError
-from idam.lab.evaluation.methods import ABLATION, RIVALS, Method
-from idam.lab.evaluation.methods.learned.weights import rival_weights_for
+from idam.lab.evaluation.methods import Method
 from idam.lab.settings import with_settings
-from idam.network.pretrained import list_models, load_model
+from idam.network.pretrained import load_model
+from idam.weights import list_models
 
-__all__ = ["ablation", "as_method", "fpfh", "gnn", "gnn_then_icp", "weights_for"]
+__all__ = [
+    "ablation",
+    "ablation_weights",
+    "as_method",
+    "find_ablation_weights",
+    "fpfh",
+    "gnn",
+    "gnn_then_icp",
+    "weights_for",
+]
+
+
+MADE_BY = (
+    "make them with python benchmarks/ablation.py FOLDER --data DIR, and name the FOLDER by --model or IDAM_ABLATION"
+)
+INFERENCE = ("iterations", "keep", "keep_again", "trusted", "keep_matches", "soft_matches")
+"""What may be set of a trained network; the rest is built in, and setting it would change nothing."""
 
 
 def gnn(model: str | None, settings: Sequence[str]) -> Method:
     """The network on GNN features; ``gnn-unseen-shapes`` unless another model is named."""
-    return _alone(model or "gnn-unseen-shapes", settings)
+    return _alone("gnn", model or "gnn-unseen-shapes", settings)
 
 
 def fpfh(model: str | None, settings: Sequence[str]) -> Method:
     """The network on FPFH features; ``fpfh-unseen-shapes`` unless another model is named."""
-    return _alone(model or "fpfh-unseen-shapes", settings)
+    return _alone("fpfh", model or "fpfh-unseen-shapes", settings)
 
 
 def gnn_then_icp(model: str | None, settings: Sequence[str]) -> Method:
@@ -52,26 +70,49 @@ def ablation(model: str | None, settings: Sequence[str]) -> Method:
         InputError: no model is named.
     """
     if model is None:
-        raise InputError("name the model, such as gnn-ablation-bs: a row of the ablation has weights of its own")
-    return _alone(model, settings)
+        raise InputError(f"a row of the ablation has weights of its own: {MADE_BY}")
+    return _alone("gnn", model, settings)
+
+
+def ablation_weights(method: str, folder: Path) -> Path:
+    """Where the weights of a row of the ablation are in a folder of them."""
+    return folder / f"gnn-{method}.safetensors"
+
+
+def find_ablation_weights(method: str, model: str | None) -> str:
+    """The file of the weights of a row of the ablation.
+
+    Args:
+        method: the row.
+        model: their folder, or a file of its own; None for the folder that IDAM_ABLATION names.
+
+    Raises:
+        InputError: the folder is not named, or does not hold them.
+    """
+    place = Path(model or os.environ.get("IDAM_ABLATION", ""))
+    path = place if place.suffix == ".safetensors" else ablation_weights(method, place)
+    if not path.is_file():
+        raise InputError(f"{path}: no such weights of the ablation; {MADE_BY}")
+    return str(path)
 
 
 def weights_for(method: str, experiment: str | None) -> str | None:
-    """The weights trained for an experiment, where the method is a rival, or the network alone and there are any."""
-    if method in RIVALS:
-        return rival_weights_for(method, experiment)
-    if method in ABLATION:
-        name = f"gnn-{method}"
-    elif "-idam" in method:
+    """The weights trained for an experiment, where the method is the network alone and there are any."""
+    if "-idam" in method:
         name = f"{method.split('-')[0]}-{experiment}"
     else:
         return None
     return name if name in list_models() else None
 
 
-def _alone(model: str, settings: Sequence[str]) -> Method:
+def _alone(features: str, model: str, settings: Sequence[str]) -> Method:
     network = load_model(model)
-    network.config = with_settings(network.config, settings)
+    if network.config.features != features:
+        raise InputError(
+            f"{model} has {network.config.features} features, which this method is not about: give --model a network "
+            f"of {features} features, or use --method register"
+        )
+    network.config = with_settings(network.config, settings, INFERENCE)
     return as_method(network)
 
 

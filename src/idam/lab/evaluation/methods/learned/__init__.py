@@ -1,1 +1,0 @@
-"""What the learned rivals share: their interface, weights, features and layers."""

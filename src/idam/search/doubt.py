@@ -1,0 +1,48 @@
+"""Why an answer may be wrong, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from idam import rigid
+from idam.rigid import Array
+from idam.search.judge import Evidence
+
+__all__ = ["doubt"]
+
+TIED = 1.0
+"""Logits of lead below which two answers are about equally good."""
+SLIGHT = 0.25
+"""Overlap below which it is what is wrong."""
+THROUGH = 0.005
+"""Share of points where the other scan saw through from which on it is what is wrong."""
+STRAIGHT = 5.0
+"""Degrees between two answers below which one is the other slid; and short of 180 above which it is turned round."""
+
+
+def doubt(evidence: Evidence, answers: Array, centre: Array) -> str:
+    """Say why an answer may be wrong.
+
+    Args:
+        evidence: what speaks for it.
+        answers: the answer and the runners-up, (A, 4, 4), in input units.
+        centre: of the source, (3,).
+    """
+    if evidence.lead < TIED and len(answers) > 1:
+        return _rival(answers[0], answers[1], centre)
+    if evidence.violation > THROUGH:
+        return f"{100 * evidence.violation:.1f} % of the points lie where the other scan saw through"
+    if evidence.overlap < SLIGHT:
+        return f"overlap about {100 * evidence.overlap:.0f} %"
+    return "the surfaces that it lays on each other look little alike"
+
+
+def _rival(answer: Array, other: Array, centre: Array) -> str:
+    """Say in what two equally good answers (4, 4) differ."""
+    turn = float(np.degrees(rigid.angle(answer[:3, :3].T @ other[:3, :3])))
+    shift = float(np.linalg.norm(rigid.apply(answer, centre[None]) - rigid.apply(other, centre[None])))
+    if turn < STRAIGHT:
+        return f"the scans slide along one direction, where their place is not fixed: {shift:.3g} further fits as well"
+    if turn > 180 - STRAIGHT:
+        return "the scans fit about as well the other way round"
+    return f"two poses, {turn:.0f} degrees apart, explain the data about equally well"

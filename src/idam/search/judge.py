@@ -1,0 +1,106 @@
+"""The judge: which of the answers is likeliest to be right, and how likely that is.
+
+Two logistic functions, fitted to registrations of synthetic pairs that the models never saw
+(``benchmarks/fit_judge.py``). The first weighs what speaks for an answer and ranks answers; the second turns the best
+answer's weight, and how far it is ahead of the next, into a probability.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+
+from idam.rigid import Array
+from idam.search.ranking import Answer
+
+__all__ = ["CONVERGED", "FEATURES", "LEAD", "Evidence", "confidence", "evidence", "features", "weight"]
+
+CONVERGED = 0.5
+"""Confidence from which an answer is one to count on."""
+LEAD = 6.0
+"""Logits past which being further ahead says no more."""
+FEATURES = ("likelihood", "overlap", "contained", "support", "violation", "close", "off", "border")
+"""What is known of an answer (:class:`idam.search.ranking.Answer`)."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the confidence is computed from.
+
+    Attributes:
+        likelihood: how much likelier the features make the answer than chance
+            (:meth:`idam.search.matching.Matching.likelihood`).
+        overlap: geometric mean of the shares of both clouds that lie on the other, in [0, 1].
+        contained: the larger of both shares, in [0, 1].
+        support: share of the feature matches that the answer brings together, in [0, 1].
+        violation: share of the points that lie where the other scan saw through, in [0, 1].
+        close: share of what touches that touches at a finer resolution, too, in [0, 1].
+        off: median distance from the other cloud's tangent planes, as a share of the reach within which clouds touch.
+        border: 1 where sparse clouds end where the other begins, less where they are mixed, in [0, 1].
+        lead: by how many logits the answer is ahead of the best other one.
+    """
+
+    likelihood: float
+    overlap: float
+    contained: float
+    support: float
+    violation: float
+    close: float
+    off: float
+    border: float
+    lead: float
+
+
+class _Fit(NamedTuple):
+    weights: Array
+    bias: float
+    scale: float
+    lead: float
+
+
+def features(answer: Answer | Evidence) -> Array:
+    """What the first function is linear in, (8,): the first bit of likelihood or violation says more than the last."""
+    return np.array(
+        [
+            math.sqrt(max(answer.likelihood, 0.0)),
+            answer.overlap,
+            answer.contained,
+            answer.support,
+            -math.log1p(min(answer.violation, 0.05) / 0.001),
+            answer.close,
+            -math.log(answer.off + 0.01),
+            math.log(answer.border),
+        ]
+    )
+
+
+def weight(answer: Answer | Evidence) -> float:
+    """What answers are ranked by: the logit that one of several is the right one, but for a constant."""
+    return float(_fit().weights @ features(answer))
+
+
+def evidence(answers: list[Answer]) -> Evidence:
+    """What speaks for the first of the answers."""
+    best, *others = answers
+    lead = weight(best) - max((weight(other) for other in others), default=-math.inf)
+    known = {field.name: getattr(best, field.name) for field in fields(Evidence) if field.name != "lead"}
+    return Evidence(**known, lead=min(lead, LEAD))
+
+
+def confidence(known: Evidence) -> float:
+    """The probability that the transform is right."""
+    fit = _fit()
+    logit = fit.bias + fit.scale * weight(known) + fit.lead * max(known.lead, -LEAD)
+    return 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, logit))))
+
+
+@lru_cache(1)
+def _fit() -> _Fit:
+    held = json.loads((resources.files("idam.search") / "judge.json").read_text())
+    return _Fit(np.array([held["weights"][name] for name in FEATURES]), held["bias"], held["scale"], held["lead"])
