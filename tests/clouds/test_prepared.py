@@ -79,7 +79,7 @@ def test_same_bits_in_whatever_order_levels_are_asked_for() -> None:
     for size, level in one.levels.items():
         np.testing.assert_array_equal(level.points, other.levels[size].points)
         assert level.spacing == other.levels[size].spacing
-    assert len(one.base.points) <= BASE
+    assert len(one.base) <= BASE
 
 
 def test_levels_are_those_of_the_centred_points(cloud: Prepared) -> None:
@@ -91,7 +91,7 @@ def test_a_level_finer_than_the_base_is_thinned_from_all_points() -> None:
     points = noise(150_000, 0) * [1.0, 0.6, 0.01]
     cloud = Prepared.of(points, "cloud")
     size = cloud.voxel_size(BASE) / 8
-    assert len(cloud.level(size).points) > len(cloud.base.points)
+    assert len(cloud.level(size).points) > len(cloud.base)
 
 
 def test_surface_in_another_unit_has_the_same_points(cloud: Prepared) -> None:
