@@ -12,8 +12,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from idam.lab.evaluation.methods import METHODS
 from idam.lab.evaluation.paper import PAPER
+from idam.lab.evaluation.table import order, short_name
 from idam.report.style import BLUE, ORANGE, VERMILLION, look, save
 
 ERRORS = {
@@ -21,7 +21,9 @@ ERRORS = {
     "unseen-categories": "unseen categories",
     "gaussian-noise": "Gaussian noise",
 }
-RECALLS = {"practice": "turned to 45 degrees", "practice-any-rotation": "turned in any way"}
+RECALLS = {"practice": "rotations up to 45 degrees", "practice-any-rotation": "any rotation"}
+
+SECOND = {"symmetric_recall": "with symmetric poses", "observable_recall": "without axisymmetric shapes"}
 
 Rows = dict[str, dict[str, Any]]
 
@@ -38,14 +40,14 @@ def read_rows(paths: list[Path]) -> dict[str, Rows]:
 
 def label(row: dict[str, Any]) -> str:
     """The method's name, with the model where it is not the method's own choice."""
-    name = str(row["method"])
+    name = short_name(str(row["method"]))
     return f"{name} ({row['model']})" if name.startswith("register") and row["model"] else name
 
 
 def panels(rows: dict[str, Rows], titles: dict[str, str]) -> tuple[Figure, list[tuple[str, Any, list[str]]]]:
     """A figure with a panel for each experiment, and the methods that all panels list, in the tables' order."""
     places = {name: row["method"] for experiment in titles for name, row in rows[experiment].items()}
-    known = sorted(places, key=lambda name: list(METHODS).index(places[name]))
+    known = sorted(places, key=lambda name: order(places[name]))
     figure = Figure((4.2 * len(titles), 0.32 * len(known) + 1.2), layout="constrained")
     axes = figure.subplots(1, len(titles), sharey=True, squeeze=False)[0]
     for experiment, panel in zip(titles, axes, strict=True):
@@ -75,13 +77,15 @@ def draw_errors(rows: dict[str, Rows]) -> Figure:
 
 
 def draw_recalls(rows: dict[str, Rows]) -> Figure:
-    """Share of pairs within 5 degrees and 0.05, of all shapes and of those without an axis of symmetry."""
+    """Share of pairs within 5 degrees and 0.05, and with the poses of symmetric shapes that look the same."""
     figure, parts = panels(rows, RECALLS)
     for experiment, panel, known in parts:
         for place, name in enumerate(known):
             if row := rows[experiment].get(name):
+                # records from before symmetric poses were counted have the shapes without an axis instead
+                other = "symmetric_recall" if "symmetric_recall" in row else "observable_recall"
                 panel.barh(place - 0.2, row["recall"], 0.38, color=BLUE, label="all shapes")
-                panel.barh(place + 0.2, row["observable_recall"], 0.38, color=ORANGE, label="without axisymmetric ones")
+                panel.barh(place + 0.2, row[other], 0.38, color=ORANGE, label=SECOND[other])
         panel.set_xlim(0, 1)
         panel.set_xlabel("share within 5 degrees and 0.05")
     handles = {label: handle for handle, label in zip(*parts[0][1].get_legend_handles_labels(), strict=True)}

@@ -7,66 +7,146 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import scans
 
-from idam.lab.evaluation.methods import METHODS
+from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.runner import Row
-from idam.lab.evaluation.table import columns
+from idam.lab.evaluation.table import columns, order, short_name
 
 TITLES = {
     "unseen-shapes": "Unseen shapes (section 4.1)",
     "unseen-categories": "Unseen categories (section 4.2)",
     "gaussian-noise": "Gaussian noise (section 4.3)",
     "ablation": "Ablation (section 4.6), on unseen categories",
-    "practice": "Closer to practice: disjoint points, crops of their own, turned to 45 degrees",
-    "practice-any-rotation": "Closer to practice, turned in any way",
+    "practice": "Disjoint points, rotations up to 45 degrees about each axis",
+    "practice-any-rotation": "Disjoint points, any rotation",
 }
+OURS = ("gnn-idam", "fpfh-idam", "register")
+"""What the names of this package's rows begin with."""
+ENOUGH = 200
+"""Pairs that a row needs to stand in the summary."""
 
 INTRODUCTION = """# Results
 
-Every figure here was computed by the command below its table; the paper's own figures stand in brackets. RMSE and MAE
-are over the zyx Euler angles, in degrees, and the coordinates of the translation; recall is the share of pairs within
-5 degrees and 0.05. Rows of fewer pairs than others ran on the first so many, for time. Times in these tables are
-medians of one pair at a time on a busy machine: compare those under Efficiency, which were interleaved on an idle one.
+{summary}
 
-- A name that ends in `-paper` is the network with the paper's inference (3 iterations, N/6 points, no further tries).
-- One that ends in `-tuned` is a rival with settings chosen on validation pairs, beside the published ones.
-- `pointnetlk`, `dcp` and `prnet` are our implementations, trained for 12 minutes of one core for each table (753 to
-  928, 88 to 114 and 66 to 73 steps of 8 pairs), where their authors trained for hours on a GPU: read them as a
-  beginning, not as those methods' worth. PRNet with noise had 26 minutes, since other work took half of its core.
-- `register` is the whole of `idam.register`, with the default model unless another is named. A fifth of what that
-  learnt from are halves of ModelNet40's training shapes, of all categories: to it, the unseen categories are not new.
-  It knows of no limit to the rotation, and may find a symmetric shape's other pose; `register-90` is told that nothing
-  turns by more than 90 degrees (`max_angle=90`): the paper's three angles of up to 45 make no more than 86. Of poses
-  that look alike, a `gnn` model named beside it chooses: it learnt how pairs are turned, and may have learnt how shapes
-  stand, since every source stands as ModelNet's shapes do.
-- `gnn-idam-icp` is the network, and the symmetric ICP that `register` ends sparse clouds with.
-- Go-ICP is in neither table closer to practice: with no point in common, its search had not ended on the first pair
-  after 17 minutes.
+RMSE / MAE of the rotation in degrees, of the row with the least MAE; for the two protocols with disjoint points, the
+highest recall. All rows, and the commands that compute them, are in the tables below.
 
-![Errors of each row](images/errors.png)
-
-![Recall on pairs closer to practice](images/practice.png)
+![Rotation errors of every method](images/errors.png)
 """
 
+ABOUT = """## How to read the tables
 
-def table(records: list[dict[str, Any]]) -> str:
+RMSE and MAE are taken over the zyx Euler angles, in degrees, and over the coordinates of the translation. Recall is the
+share of pairs within 5 degrees and 0.05. The paper's own figures stand in brackets. The commands below each table
+compute it. Times are medians for one pair at a time on a machine that was also doing other work; the times to compare
+are those under Efficiency, which were measured in turns on an idle machine. A row that ran on fewer pairs than the
+others, for time, says on how many.
+
+- `...-paper`: the network with the paper's inference: 3 iterations, N/6 points, no further tries.
+- `...-tuned`: a method of others with settings chosen on validation pairs, beside its published settings.
+- `pointnetlk`, `dcp`, `prnet`: our implementations (`benchmarks/rivals`), trained for 12 minutes of one core for each
+  table (753 to 928, 88 to 114 and 66 to 73 steps of 8 pairs; PRNet with noise 26 minutes, sharing its core). Their
+  authors trained for hours on a GPU. These rows show what little training gives, not what the methods can do.
+- `register`: the whole of `idam.register`, with the default model unless another is named. A fifth of that model's
+  training data are halves of ModelNet40's training shapes, of all categories, so the unseen categories are not new to
+  it. It assumes no limit on the rotation and may find another pose of a symmetric shape.
+- `register-90`: the same with `max_angle=90`; the paper's three angles of up to 45 degrees make at most 86. Among poses
+  that look alike, the `gnn` model named beside it chooses. It has learnt how pairs are rotated, and may have learnt
+  which way up shapes stand, since every source stands as ModelNet's shapes do.
+- `gnn-idam-icp`: the network, then the symmetric ICP that `register` ends with on sparse clouds.
+- Go-ICP is missing where the clouds share no point: its search had not finished the first pair after 17 minutes."""
+
+PRACTICE = """## Closer to practice
+
+Both clouds are random halves of a shape's points, so that they share no point; each is cropped to 70 % by its own
+half-space, with noise. "With symmetric poses" also counts answers within 5 degrees and 0.05 of a pose that puts the
+whole shape onto itself (mean distance below 0.02), such as the half turn of a table.
+
+![Recall of every method](images/practice.png)"""
+
+Record = dict[str, Any]
+
+
+def table(records: list[Record]) -> str:
     """One experiment's table, of all files that hold rows of it, and where they come from."""
     experiment = records[0]["pairs_from"]
     if len({record["checksum"] for record in records}) > 1:
         raise SystemExit(f"{experiment}: the files are of different pairs")
     cells = columns(experiment)
     lines = [f"## {TITLES[experiment]}", "", line(list(cells)), line(["---"] * len(cells))]
-    rows = [row for record in records for row in record["rows"]]
-    for row in sorted(rows, key=lambda row: list(METHODS).index(row["method"])):
+    rows = sorted((row for record in records for row in record["rows"]), key=lambda row: order(row["method"]))
+    most = max((row["pairs"] for row in rows if "missing" not in row), default=0)
+    for row in rows:
         if "missing" in row:
             lines.append(line([row["method"], row["missing"].split(":")[0], *[""] * (len(cells) - 2)]))
-        else:
-            lines.append(line([cell(Row.from_dict(row)) for cell in cells.values()]))
+            continue
+        name, *others = (cell(Row.from_dict(row)) for cell in cells.values())
+        lines.append(line([name if row["pairs"] == most else f"{name}, first {row['pairs']} pairs", *others]))
     return "\n".join([*lines, "", *map(origin, records)])
+
+
+def summary(tables: dict[str, list[Record]]) -> str:
+    """The best of this package and of others, here and as the paper reports them, by experiment."""
+    lines = [
+        line(["", "idam", "IDAM in the paper", "best of others, here", "best of others in the paper"]),
+        line(["---"] * 5),
+    ]
+    for experiment, records in tables.items():
+        rows = [row for record in records for row in record["rows"] if "missing" not in row and row["pairs"] >= ENOUGH]
+        if experiment == "ablation" or not rows:
+            continue
+        ours = [row for row in rows if row["method"].startswith(OURS)]
+        others = [row for row in rows if not row["method"].startswith(OURS)]
+        show = best_recall if experiment.startswith("practice") else best_error
+        reported = PAPER.get(experiment, {})
+        lines.append(
+            line(
+                [
+                    TITLES[experiment].split(" (")[0],
+                    show(ours),
+                    best_reported({name: row for name, row in reported.items() if name.endswith("-idam")}),
+                    show(others),
+                    best_reported({name: row for name, row in reported.items() if not name.endswith("-idam")}),
+                ]
+            )
+        )
+    return "\n".join(lines)
+
+
+def best_error(rows: list[Record]) -> str:
+    """The row of least MAE."""
+    if not rows:
+        return ""
+    best = min(rows, key=lambda row: float(row["mae_r"]))
+    return f"{best['rmse_r']:.3f} / {best['mae_r']:.3f} ({named(best)})"
+
+
+def best_recall(rows: list[Record]) -> str:
+    """The row of highest recall."""
+    if not rows:
+        return ""
+    best = max(rows, key=lambda row: float(row["recall"]))
+    return f"{best['recall']:.3f} ({named(best)})"
+
+
+def best_reported(reported: Mapping[str, Sequence[float]]) -> str:
+    """The row of least MAE among those that the paper reports."""
+    if not reported:
+        return ""
+    name = min(reported, key=lambda name: reported[name][1])
+    return f"{reported[name][0]:g} / {reported[name][1]:g} ({name})"
+
+
+def named(row: Record) -> str:
+    """The method of a row, with the model where the method has a choice."""
+    model = f" with {row['model']}" if row["model"] and row["method"].startswith("register") else ""
+    return f"{short_name(row['method'])}{model}, {row['pairs']} pairs"
 
 
 def origin(record: dict[str, Any]) -> str:
@@ -131,13 +211,16 @@ def main() -> None:
     parser.add_argument("records", type=Path, nargs="+")
     files = [json.loads(path.read_text()) for path in parser.parse_args().records]
     records = [content for content in files if isinstance(content, dict)]
-    tables = [[r for r in records if r.get("pairs_from") == experiment] for experiment in TITLES]
-    sections = [table(group) for group in tables if group]
+    tables = {name: [r for r in records if r.get("pairs_from") == name] for name in TITLES}
+    tables = {name: group for name, group in tables.items() if group}
+    sections = [INTRODUCTION.format(summary=summary(tables)).rstrip(), ABOUT]
+    sections += [table(group) for name, group in tables.items() if not name.startswith("practice")]
+    sections += [PRACTICE]
+    sections += [table(group) for name, group in tables.items() if name.startswith("practice")]
     sections += [efficiency(record) for record in records if "median_ms" in record]
     sections += [scale(content) for content in files if isinstance(content, list)]
     sections += [real_scans(record) for record in records if "records" in record]
     sections += [confidences(record) for record in records if "calibration_error" in record]
-    print(INTRODUCTION)
     print("\n\n".join(sections))
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from idam.search.confidence import Evidence
 
 import idam
 from idam import RegistrationResult
 from idam.errors import InputError
 from idam.io import read_transform
 from idam.result import Hypothesis, Matches
-from idam.search.confidence import Evidence
 from motions import rigid
 from solids import distances
 

@@ -101,6 +101,7 @@ def register(
         hypotheses=others,
         max_correspondence_distance=solution.distance,
         information=solution.information,
+        strength=solution.strength,
         matches=solution.matches,
         model=models.name,
         seconds=time.perf_counter() - started,

@@ -17,6 +17,7 @@ from idam.clouds.surfaces import nearest_within
 from idam.errors import InputError
 from idam.rigid import Array, Rows
 from idam.search.judge import Evidence
+from idam.search.strength import Strength
 
 __all__ = ["Hypothesis", "Matches", "RegistrationResult", "chance"]
 
@@ -68,6 +69,7 @@ class RegistrationResult:
         information: (6, 6), the inverse of the covariance of x where T exp(x) is the true transform: rotation in
             radians before translation in input units, perturbed from the right in the source's frame, as GTSAM's
             ``Pose3``. Zero where too little overlaps to tell.
+        strength: what the data fix of the transform and what they leave free.
         matches: the feature matches, and how well the answer agrees with each.
         model: names of the weights that answered.
         seconds: wall-clock time it took.
@@ -84,6 +86,7 @@ class RegistrationResult:
     hypotheses: list[Hypothesis]
     max_correspondence_distance: float
     information: Array
+    strength: Strength
     matches: Matches
     model: str
     seconds: float
@@ -161,6 +164,7 @@ class RegistrationResult:
                 {"transformation": other.transformation.tolist(), "score": other.score} for other in self.hypotheses
             ],
             "information": self.information.tolist(),
+            "strength": {"motions": self.strength.motions.tolist(), "fixed": self.strength.fixed.tolist()},
             "model": self.model,
             "seconds": self.seconds,
         }

@@ -9,6 +9,9 @@ import numpy as np
 from idam import rigid
 from idam.align import align, reaches
 from idam.align.information import information
+from idam.align.patches import Dense
+from idam.align.polish import finished
+from idam.clouds.prepared import ALL
 from idam.clouds.pyramid import Pyramid
 from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
@@ -17,11 +20,16 @@ from idam.rigid import Array
 from idam.search.judge import Evidence
 from idam.search.scope import Scope
 from idam.search.stages import search
+from idam.search.strength import Strength, strength
 
 __all__ = ["Solution", "solve"]
 
 FEW_POINTS = 1024
 """Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
+
+
+DENSE = 500_000
+"""Points of each cloud that the last stage uses at most."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,7 @@ class Solution:
         evidence: what speaks for the first.
         matches: of features.
         information: (6, 6), of T exp(x), rotation before translation.
+        strength: what the data fix and what they leave free.
         distance: within which points count as inliers.
         source_misses: the distance from each point of the thinned source, moved by the answer, to the target, (N,).
         target_misses: likewise from the target to the source, (P,).
@@ -42,6 +51,7 @@ class Solution:
     evidence: Evidence
     matches: Matches
     information: Array
+    strength: Strength
     distance: float
     source_misses: Array
     target_misses: Array
@@ -60,12 +70,13 @@ class Solution:
     def inverted(self) -> Solution:
         """The same with source and target exchanged."""
         answers = [replace(answer, transformation=rigid.inverse(answer.transformation)) for answer in self.answers]
+        change = -rigid.adjoint(self.answers[0].transformation)  # (T exp(x))^-1 = T^-1 exp(-Ad x)
         return replace(
             self,
             answers=answers,
             matches=Matches(self.matches.target, self.matches.source, self.matches.weight),
-            # (T exp(x))^-1 = T^-1 exp(-Ad x)
-            information=rigid.carried(self.information, rigid.adjoint(self.answers[0].transformation)),
+            information=rigid.carried(self.information, change),
+            strength=self.strength.carried(change),
             source_misses=self.target_misses,
             target_misses=self.source_misses,
         )
@@ -82,10 +93,11 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
         refine: method of fine alignment, or None.
     """
     method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
-    scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle)
+    scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle, given=guess is not None)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
-    best = align(surfaces, found.best, reaches(method)[1], method)
+    start = align(surfaces, found.best, reaches(method)[1], method)
+    best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last=refine == "gicp")
     poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
     return Solution(
         answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],
@@ -95,8 +107,18 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
             matches.target * unit + clouds.target.centre,
             found.weights,
         ),
-        information=clouds.information_left(information(surfaces, best)),
+        information=clouds.information_left(information(pairs)),
+        strength=strength(surfaces, best).carried(clouds.to_input / unit),
         distance=TOUCHING * surfaces.spacing * unit,
         source_misses=unit * surfaces.target.nearest(rigid.apply(best, surfaces.source.points))[0],
         target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(best), surfaces.target.points))[0],
     )
+
+
+def dense(clouds: Pyramid) -> tuple[Dense, Dense]:
+    """Both clouds in working units with all points, or every n-th."""
+    level = clouds.fine
+    if level.source_level.voxel_size == ALL:
+        return Dense.of_surface(level.surfaces.source), Dense.of_surface(level.surfaces.target)
+    source, target = (Dense.of(cloud.every(DENSE) / clouds.unit) for cloud in (clouds.source, clouds.target))
+    return source, target

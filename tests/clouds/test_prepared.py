@@ -7,6 +7,7 @@ import pytest
 
 from idam.clouds.prepared import ALL, BASE, FINE, LARGER, SMALL, Level, Prepared
 from idam.clouds.voxels import downsample, ladder, rung
+from idam.describe.invariant import Surroundings
 from solids import noise, shell, spacing_by_definition
 
 UTM = np.array([5e5, 5.6e6, 100.0])
@@ -17,11 +18,11 @@ class Counted:
 
     def __init__(self, key: str = "counted") -> None:
         self.key = key
-        self.spacings: list[float] = []
+        self.sizes: list[float] = []
 
-    def __call__(self, points: np.ndarray, spacing: float) -> np.ndarray:
-        self.spacings.append(spacing)
-        return np.stack([points[:, 0] / spacing, points[:, 1] / spacing], 1).astype(np.float32)
+    def describe(self, around: Surroundings) -> np.ndarray:
+        self.sizes.append(float(np.ptp(around.points[:, 0])))
+        return around.points[:, :2]
 
 
 @pytest.fixture
@@ -57,11 +58,12 @@ def test_levels_are_made_once(cloud: Prepared) -> None:
     descriptor, other = Counted(), Counted("other")
     for _ in range(3):
         level.described(descriptor, level.spacing_rung)
-    assert descriptor.spacings == [ladder(level.spacing_rung)]
+    (size,) = descriptor.sizes  # in spacings
+    assert size == pytest.approx(np.ptp(level.points[:, 0]) / ladder(level.spacing_rung), rel=1e-6)
     level.described(descriptor, level.spacing_rung + 1)
-    assert len(descriptor.spacings) == 2
+    assert len(descriptor.sizes) == 2
     level.described(other, level.spacing_rung)
-    assert len(other.spacings) == 1
+    assert len(other.sizes) == 1
 
 
 def test_same_bits_in_whatever_order_levels_are_asked_for() -> None:
@@ -77,7 +79,7 @@ def test_same_bits_in_whatever_order_levels_are_asked_for() -> None:
     for size, level in one.levels.items():
         np.testing.assert_array_equal(level.points, other.levels[size].points)
         assert level.spacing == other.levels[size].spacing
-    assert len(one.base.points) <= BASE
+    assert len(one.base) <= BASE
 
 
 def test_levels_are_those_of_the_centred_points(cloud: Prepared) -> None:
@@ -89,7 +91,7 @@ def test_a_level_finer_than_the_base_is_thinned_from_all_points() -> None:
     points = noise(150_000, 0) * [1.0, 0.6, 0.01]
     cloud = Prepared.of(points, "cloud")
     size = cloud.voxel_size(BASE) / 8
-    assert len(cloud.level(size).points) > len(cloud.base.points)
+    assert len(cloud.level(size).points) > len(cloud.base)
 
 
 def test_surface_in_another_unit_has_the_same_points(cloud: Prepared) -> None:

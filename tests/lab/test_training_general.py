@@ -20,6 +20,7 @@ from idam.describe.invariant import surroundings
 from idam.errors import InputError
 from idam.lab.data import general as scans
 from idam.lab.data.modelnet40 import Shapes
+from idam.lab.data.working import TOUCHING
 from idam.lab.training import Recipe, general, loop, train
 from idam.lab.training.batches import VALIDATION_SEED
 from idam.lab.training.general import (
@@ -35,6 +36,7 @@ from idam.lab.training.general import (
     matching_of,
     scanned,
 )
+from idam.lab.training.recipe import check
 from idam.network.config import Config
 from idam.network.features.invariant import Invariant
 from idam.network.pretrained import load_model
@@ -105,6 +107,24 @@ def same(one: ScannedPair, other: ScannedPair) -> bool:
 def numbers(lesson: Lesson, task: GeneralTask) -> list[int]:
     """Which of the six pairs a lesson has."""
     return [next(n for n in range(6) if same(task.pair(n), pair)) for pair in lesson.pairs]
+
+
+def test_one_s_own_pairs_are_learnt_from_and_held_out(make, tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    scans_of, count = rng.standard_normal((9, 40, 3)), 9
+    arrays = {"source": scans_of, "target": scans_of, "R": np.tile(np.eye(3), (count, 1, 1)), "t": np.zeros((count, 3))}
+    np.savez(tmp_path / "mine.npz", **arrays)
+    kept = []
+    monkeypatch.setattr(general, "scanned", lambda draw, material, *_: kept.append(material))
+    task = make(pairs=str(tmp_path / "mine.npz"))
+    assert len(task.material.pairs) == 7
+    assert [len(material.pairs) for material in kept] == [2, 2]
+    assert "9 pairs of" in task.data
+
+
+def test_own_pairs_are_for_general_training_alone():
+    with pytest.raises(InputError, match="--pairs are for general training"):
+        check(Recipe(pairs="mine.npz"))
 
 
 # the loss
@@ -205,7 +225,7 @@ def test_a_pair_s_clouds_overlap_under_the_truth(make, draw):
         pair = draw(material, np.random.default_rng((3, n)))
         found = scanned(draw, material, 3, n)
         distance = torch.cdist(found.aligned.double(), found.goal.double())
-        shares = [(distance.amin(way) < scans.TOUCHING).double().mean() for way in (0, 1)]
+        shares = [(distance.amin(way) < TOUCHING).double().mean() for way in (0, 1)]
         assert min(shares).item() == pytest.approx(pair.overlap, abs=1e-9)
         for side, cloud in ((found.source, found.aligned), (found.target, found.goal)):
             assert len(side.points) == len(cloud)

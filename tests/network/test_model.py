@@ -294,7 +294,38 @@ def test_every_second_try_begins_where_the_best_led_and_its_transform_is_the_who
             best = homogeneous(step.rotation[b], step.translation[b]) @ best
         np.testing.assert_allclose(homogeneous(out.rotation[b], out.translation[b]), best, atol=1e-10)
     assert torch.equal(out.trust, torch.stack([first.trust, again.trust, step.trust]).amax(0))
-    torch.testing.assert_close(out.source.points, gather_points(source, out.source.index))
+    assert torch.equal(out.source.index, first.source.index)
+    assert out.iterations is first.iterations
+
+
+def test_only_pairs_that_are_not_trusted_go_on(make_model, randn, tries):
+    source, target = randn(3, 40, 3), randn(3, 50, 3)
+    model = make_model(keep_again=(1.0,), trusted=2.0)
+    every = model(source, target)
+    first = tries[0][2]
+    tries.clear()
+    model.config = replace(model.config, trusted=float(first.trust.sort().values[1:].mean()))
+    out = model(source, target)
+    sure = first.trust >= model.config.trusted
+    assert 0 < sure.sum() < 3
+    assert len(tries[1][1].points) == (~sure).sum()
+    for b in range(3):
+        expected = first if sure[b] else every
+        assert out.trust[b] >= first.trust[b]
+        if sure[b] or every.trust[b] == first.trust[b]:
+            torch.testing.assert_close(out.rotation[b], expected.rotation[b])
+
+
+def test_iterations_end_where_no_point_moves_and_not_before_each_block_had_its_own(make_model, randn):
+    source = randn(2, 40, 3)
+    still = source, source.clone()  # matched to itself, nothing moves
+    model = make_model(iterations=3)
+    whole = model(*still)
+    model.config = replace(model.config, iterations=30)
+    ended = model(*still)
+    assert [len(out.iterations) for out in (whole, ended)] == [3, 3]
+    assert torch.equal(whole.rotation, ended.rotation)
+    assert len(model.train().iterate(*(keys for keys in still), *(model.features(x) for x in still))) == 30
 
 
 @pytest.mark.parametrize("features", ["gnn", "fpfh"])

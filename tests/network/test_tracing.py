@@ -1,4 +1,4 @@
-"""With neighbours given, nothing is searched: features and network can be traced and exported, and run on any device."""
+"""With neighbours given, nothing is searched: features and network trace and export, and run on any device."""
 
 import io
 import warnings

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.report.page import MAX_POINTS, RUNNERS_UP, write_report
 from idam.result import Hypothesis, Matches, RegistrationResult
-from idam.search.confidence import Evidence
 
 HERE = (0.0, 0.0, 0.0)
 NATIONAL_GRID = (512_300.0, 5_403_200.0, 320.0)
@@ -52,12 +52,10 @@ def make_pair(
     rows = rng.integers(count, size=match_count)
     weight = np.where(rng.random(match_count) < 0.3, 0.0, rng.random(match_count))
     matches = Matches(source[rows], target[rows], weight / max(weight.sum(), 1))
-    pairs = np.stack([np.arange(count), np.arange(count)], axis=1)
     result = RegistrationResult(
         transformation=transformation,
         fitness=0.75,
         inlier_rmse=0.0123,
-        correspondence_set=pairs,
         confidence=confidence,
         converged=confidence >= 0.5,
         reason=reason,
@@ -68,6 +66,7 @@ def make_pair(
         matches=matches,
         model=model,
         seconds=0.042,
+        clouds=(source, target),
     )
     return PointCloud(source), PointCloud(target), result
 
@@ -218,7 +217,7 @@ def test_names_are_shown_as_they_are_and_never_become_markup(tmp_path: Path, nam
 
 
 def test_scene_could_not_end_its_script_element(tmp_path: Path) -> None:
-    from idam.report import _json
+    from idam.report.page import _json
 
     value = {"name": "</script><!--<script>&\u2028"}
     text = _json(value)

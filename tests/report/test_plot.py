@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.result import Matches, RegistrationResult
-from idam.search.confidence import Evidence
 
 matplotlib = pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
 
@@ -45,7 +45,6 @@ def result(target: np.ndarray) -> RegistrationResult:
         transformation=transformation,
         fitness=0.9,
         inlier_rmse=0.01,
-        correspondence_set=np.zeros((0, 2), np.int64),
         confidence=0.871,
         converged=True,
         reason="",
@@ -56,6 +55,7 @@ def result(target: np.ndarray) -> RegistrationResult:
         matches=Matches(source[:60], target[:60], weight.clip(0) / weight.clip(0).sum()),
         model="default",
         seconds=0.1,
+        clouds=(source, target),
     )
 
 

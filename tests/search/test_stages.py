@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from idam.search.judge import CONVERGED, confidence, weight
 
-from idam.clouds.prepared import Describes, Prepared
+from idam.clouds.prepared import Prepared
 from idam.clouds.pyramid import Pyramid
-from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence
+from idam.describe.invariant import Descriptor, Surroundings
 from idam.search.matching import FeatureMatches
 from idam.search.ranking import Answer, same
 from idam.search.scope import Scope
@@ -17,9 +18,11 @@ from idam.search.stages import (
     CONTENDERS,
     SURE,
     TAUGHT,
+    TIED,
     Found,
     Network,
     first_of_its_kind,
+    judged,
     least_turned,
     search,
 )
@@ -38,27 +41,27 @@ def pyramid(source: np.ndarray, target: np.ndarray) -> Pyramid:
     return Pyramid(Prepared.of(source, "source"), Prepared.of(target, "target"))
 
 
+class Speechless:
+    """Features of which all are alike."""
+
+    key = "speechless"
+
+    def describe(self, around: Surroundings) -> np.ndarray:
+        return np.zeros((len(around.points), 4), np.float32)
+
+
 def look(
     clouds: Pyramid,
     scope: Scope = ALL,
     method: str = "gicp",
     network: Network | None = None,
-    descriptor: Describes | None = None,
+    descriptor: Descriptor | Speechless | None = None,
 ) -> Found:
     return search(clouds, descriptor or load_descriptor(), network, scope, method)
 
 
 def not_asked(guess: np.ndarray) -> np.ndarray:
     pytest.fail("the network was asked")
-
-
-class Speechless:
-    """Features of which all are alike."""
-
-    key = "speechless"
-
-    def __call__(self, points: np.ndarray, spacing: float) -> np.ndarray:
-        return np.zeros((len(points), 4), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +150,7 @@ def test_of_a_symmetric_object_s_poses_the_one_nearest_to_the_guess_comes_first(
     clouds = pyramid(box((1.2, 0.8, 0.5), 2500, seed=1), move(turn, box((1.2, 0.8, 0.5), 2500, seed=2)))
     found = look(clouds, Scope(half_turn))
     assert degrees(found.best, turn @ half_turn) < 3
-    assert found.evidence.margin < CLOSE
+    assert found.evidence.lead < TIED
 
 
 # --- a network -----------------------------------------------------------------------------------------------------
@@ -194,7 +197,7 @@ def test_of_poses_alike_the_network_chooses_among_those_it_was_taught(prism: Pyr
     np.testing.assert_allclose(found.best, about_z(-50), atol=0.07)
     # there is another, and the answer is no surer for being chosen
     assert any(np.allclose(other.transformation, about_z(40), atol=0.07) for other in found.answers[1:])
-    assert found.evidence.margin < CLOSE
+    assert found.evidence.lead < TIED
     without = look(prism, Scope(np.eye(4), TAUGHT), "symmetric")
     np.testing.assert_allclose(without.best, about_z(40), atol=0.07)
 
@@ -210,10 +213,8 @@ def test_a_network_that_is_far_off_chooses_nothing(prism: Pyramid) -> None:
 
 def test_answers_are_unlike_each_other_the_best_first(unrelated: Pyramid) -> None:
     found = look(unrelated)
-    scores = [answer.score for answer in found.answers]
-    assert 1 < len(scores) <= CONTENDERS
-    assert scores[1:] == sorted(scores[1:], reverse=True)
-    assert scores[0] >= (1 - CLOSE) * max(scores)
+    assert 1 < len(found.answers) <= CONTENDERS
+    assert weight(found.answers[0]) >= max(map(weight, found.answers)) - TIED
     for n, answer in enumerate(found.answers):
         assert not any(same(answer.transformation, other.transformation) for other in found.answers[:n])
 
@@ -223,8 +224,9 @@ def turned(angle: float, likelihood: float) -> Answer:
 
 
 def test_of_answers_as_good_as_the_best_the_one_nearest_to_the_guess_comes_first() -> None:
-    best, turn, slight = turned(180, 1.0), turned(90, 0.98), turned(20, 0.95)
-    worse = turned(0, 0.99 - CLOSE)
+    best, turn, slight, worse = turned(180, 1.0), turned(90, 0.9999), turned(20, 0.9998), turned(0, 0.1)
+    assert weight(best) - TIED < weight(slight)
+    assert weight(worse) < weight(best) - TIED
     assert least_turned([best, turn, slight, worse], np.eye(4)) == [slight, best, turn, worse]
     assert least_turned([best, turn, slight, worse], about_z(100)) == [turn, best, slight, worse]
     assert least_turned([best], np.eye(4)) == [best]
@@ -256,31 +258,12 @@ def test_weights_of_the_matches_sum_to_one_or_are_all_nothing(holding: Found) ->
     np.testing.assert_array_equal(nowhere.weights, np.zeros(60))
 
 
-def test_evidence_is_that_of_the_first_answer_and_the_margin_of_the_only_one_is_whole(holding: Found) -> None:
-    assert holding.evidence == Evidence(overlap=0.9, support=0.5, likelihood=2.5, margin=1.0)
-    assert replace(holding, answers=[*holding.answers, Answer(FAR)]).evidence.margin == 1.0
-
-
-def test_margin_is_how_much_less_the_next_best_scores_as_a_share(holding: Found) -> None:
-    def margin(*answers: Answer) -> float:
-        return replace(holding, answers=list(answers)).evidence.margin
-
-    best, second, third = (Answer(rigid([x, 0, 0], [0, 0, 0]), likelihood=x) for x in (2.0, 0.5, 0.3))
-    assert margin(best, second, third) == margin(best, third, second) == pytest.approx(0.75)
-    assert margin(best, replace(best, transformation=FAR)) == 0.0
-    # first because it turns least, though another is a little better
-    assert margin(second, best) == 0.0
-    # nothing touches
-    assert margin(Answer(FAR)) == margin(Answer(FAR), Answer(np.eye(4))) == 0.0
-
-
-def test_refined_moves_the_best_and_drops_those_that_end_where_it_does(holding: Found) -> None:
+def test_those_that_may_be_right_are_refined_and_those_that_end_alike_are_one(holding: Found) -> None:
     surfaces = holding.matching.clouds.surfaces
     near = rigid([0.03, 0.0, -0.02], [0.01, 0.0, 0.0]) @ TRUTH
     beside = TRUTH @ rigid([0.0, 0.2, 0.0], [0.02, 0.0, 0.0])
-    other = TRUTH @ about_z(120)
-    started = replace(holding, answers=[Answer(near, 0.5), Answer(beside, 0.4), Answer(other, 0.3)])
-    refined = started.refined(surfaces, "point")
-    np.testing.assert_allclose(refined.best, TRUTH, atol=1e-3)
-    np.testing.assert_array_equal([a.transformation for a in refined.answers[1:]], [other])
-    assert started.refined(surfaces, "none") is started
+    far = TRUTH @ about_z(120)
+    answers = [Answer(x, likelihood=y) for x, y in ((near, 0.5), (beside, 0.4), (far, 0.01))]
+    best, *others = judged(answers, holding.matching, "point", surfaces)
+    np.testing.assert_allclose(best.transformation, TRUTH, atol=1e-3)
+    np.testing.assert_array_equal([answer.transformation for answer in others], [far])

@@ -1,5 +1,5 @@
-"""Fine alignment: small_gicp's methods, and a symmetric one for sparse clouds."""
+"""Fine alignment: small_gicp's methods, a symmetric one for sparse clouds, a last stage, and how precise it ends."""
 
-from idam.align.methods import METHODS, align, reaches, refine
+from idam.align.methods import METHODS, align, copies, reaches, refine
 
-__all__ = ["METHODS", "align", "reaches", "refine"]
+__all__ = ["METHODS", "align", "copies", "reaches", "refine"]

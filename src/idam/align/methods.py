@@ -9,7 +9,7 @@ from idam.clouds.surfaces import Surfaces
 from idam.errors import InputError
 from idam.rigid import Array
 
-__all__ = ["METHODS", "align", "reaches", "refine"]
+__all__ = ["METHODS", "align", "copies", "reaches", "refine"]
 
 SMALL_GICP = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
 METHODS = (*SMALL_GICP, "symmetric")
@@ -82,12 +82,12 @@ def align(surfaces: Surfaces, start: Array, reach: float, method: str, iteration
         return start
     if method == "symmetric":
         points = refine(surfaces, start, surfaces.spacing, "point", 100)
-        if _copies(surfaces, points):
+        if copies(surfaces, points):
             return points
     return refine(surfaces, start, reach * surfaces.spacing, method, iterations)
 
 
-def _copies(surfaces: Surfaces, transformation: Array) -> bool:
+def copies(surfaces: Surfaces, transformation: Array) -> bool:
     """Whether the source points that a transform lays on the target lie as near as copies do."""
     distance, _, _ = surfaces.touching(transformation)
     return len(distance) > 0 and bool(np.median(distance) < COPIES * surfaces.spacing)

@@ -69,4 +69,4 @@ def _step(surfaces: Surfaces, transformation: Array, reach: float) -> Array:
     gradient = np.concatenate([np.cross(p, directions), directions], -1).reshape(-1, 6)
     weighted = gradient * (np.array([1.0, PULL, PULL, PULL])[:, None] * weight).reshape(-1, 1)
     system = gram(weighted, np.concatenate([gradient, residual.reshape(-1, 1)], 1))
-    return np.linalg.solve(system[:, :6] + DAMPING * np.eye(6), -system[:, 6])
+    return np.asarray(np.linalg.solve(system[:, :6] + DAMPING * np.eye(6), -system[:, 6]))

@@ -10,11 +10,13 @@ import typer
 
 from idam import __version__
 from idam.cli.apply import apply
+from idam.cli.batch import batch
 from idam.cli.data import data
 from idam.cli.demo import demo
 from idam.cli.evaluate import evaluate
 from idam.cli.figures import figures
 from idam.cli.info import info
+from idam.cli.merge import merge
 from idam.cli.models import models
 from idam.cli.register import register
 from idam.cli.shared import BAD_INPUT
@@ -76,6 +78,6 @@ def about(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-for command in (register, apply, info, demo, models, train, evaluate, figures):
+for command in (register, merge, batch, apply, info, demo, models, train, evaluate, figures):
     app.command()(command)
 app.add_typer(data, name="data")

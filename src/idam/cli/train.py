@@ -26,6 +26,10 @@ def train(
     start: Annotated[
         str | None, typer.Option(help="Name or file of a model, or a last.ckpt, whose weights to start from.")
     ] = None,
+    pairs: Annotated[
+        Path | None,
+        typer.Option(help="Your own scans for general training, as 'evaluate --pairs' takes them: half of all pairs."),
+    ] = None,
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
     ] = False,
@@ -47,6 +51,8 @@ def train(
     r"""Train a model; the defaults are the paper's recipe. Under torchrun it uses every process.
 
     General training, on scans as practice has them, teaches features and significance alone: see the last example.
+
+    With --pairs, half of what it learns from are your own scans; --start general goes on from the default model.
 
     Its data may have a folder 'meshes' of .ply meshes besides. Noise, radius and keep play no part in it.
 
@@ -74,6 +80,7 @@ def train(
         schedule=schedule,
         learning_rate=learning_rate,
         start=start,
+        pairs=None if pairs is None else str(pairs),
         eliminate=eliminate,
         radius=radius,
         keep=keep,

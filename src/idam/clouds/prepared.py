@@ -55,6 +55,10 @@ class Level:
     _surfaces: dict[float, Surface] = field(default_factory=dict, repr=False)
     _spacing: list[float] = field(default_factory=list, repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: small_gicp's surfaces do not, and are made anew there."""
+        return {**self.__dict__, "_surfaces": {}}
+
     @property
     def spacing(self) -> float:
         """The median distance of neighbouring points, in input units."""
@@ -112,10 +116,12 @@ class Prepared:
         """The power of two nearest to the radius: the working unit of two clouds of this size."""
         return float(2.0 ** round(math.log2(self.radius)))
 
-    @property
-    def base(self) -> Level:
-        """The points that all levels are thinned from, :data:`BASE` at most."""
-        return self.level(self.voxel_size(BASE))
+    @cached_property
+    def base(self) -> Array:
+        """The points that all levels are thinned from, :data:`BASE` at most, (N, 3), relative to the centre."""
+        points = self._centred()
+        step = rung_for(points, BASE, self.radius)
+        return points if step is None else downsample(points, ladder(step))
 
     @cached_property
     def depth(self) -> DepthMap | None:
@@ -126,22 +132,25 @@ class Prepared:
     def voxel_size(self, count: int) -> float:
         """The voxel size of the ladder that leaves at most ``count`` points, :data:`ALL` where there are no more."""
         if count not in self._rungs:
-            points = self._centred() if count >= BASE else self.base.points
-            self._rungs[count] = rung_for(points, count, self.radius)
+            self._rungs[count] = rung_for(self.base, count, self.radius)
         step = self._rungs[count]
         return ALL if step is None else ladder(step)
 
     def level(self, voxel_size: float) -> Level:
-        """The cloud on a voxel grid, thinned from the next finer level."""
+        """The cloud on a voxel grid."""
         if voxel_size not in self.levels:
-            self.levels[voxel_size] = Level(self._thinned(voxel_size), voxel_size)
+            # a voxel grid merges copies of a point, too
+            thinned = np.unique(self.base, axis=0) if voxel_size == ALL else downsample(self.base, voxel_size)
+            self.levels[voxel_size] = Level(thinned, voxel_size)
         return self.levels[voxel_size]
 
-    def _thinned(self, voxel_size: float) -> Array:
-        if voxel_size == ALL:  # a voxel grid merges copies of a point, too
-            return np.unique(self._centred(), axis=0)
-        base = self.voxel_size(BASE)
-        return downsample(self.base.points if voxel_size > base > ALL else self._centred(), voxel_size)
+    def every(self, most: int) -> Array:
+        """Points (N, 3) relative to the centre, in input units: every n-th, so that ``most`` at most are left.
+
+        What a voxel grid does not do: leave the noise of the points as it is.
+        """
+        points = self._centred()
+        return np.ascontiguousarray(points[:: -(-len(points) // most)])
 
     def _centred(self) -> Array:
         """The points (N, 3) relative to the centre, in input units, without strays."""

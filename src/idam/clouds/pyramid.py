@@ -160,8 +160,13 @@ class Pyramid:
 
         The input's x lives in the source's own frame, its translation in input units.
         """
-        to_input = rigid.adjoint(rigid.transform(np.eye(3), self.source.centre))
-        return rigid.carried(working, to_input @ np.diag([1.0, 1.0, 1.0, self.unit, self.unit, self.unit]))
+        return rigid.carried(working, self.to_input)
+
+    @property
+    def to_input(self) -> Array:
+        """The matrix (6, 6) that takes twists of the source's working frame to those of its input frame."""
+        scale = np.diag([1.0, 1.0, 1.0, self.unit, self.unit, self.unit])
+        return rigid.adjoint(rigid.transform(np.eye(3), self.source.centre)) @ scale
 
     def _check(self, level: PairLevel) -> None:
         both = (self.source, level.source_level), (self.target, level.target_level)
@@ -169,7 +174,7 @@ class Pyramid:
             left, ratio = len(thinned.points), other.radius / cloud.radius
             if left < MIN_POINTS and ratio > ODD_SIZES:
                 raise InputError(
-                    f"{other.name}: {ratio:.3g} times the size of {cloud.name}; if their units differ, scale one of "
+                    f"{other.name}: {ratio:.0f} times the size of {cloud.name}; if their units differ, scale one of "
                     "them, or crop the larger cloud to the other's size"
                 )
             if left < MIN_POINTS:

@@ -61,6 +61,8 @@ class DepthMap:
         ray = points - eye
         distance = np.linalg.norm(ray, axis=1)
         ray, distance = ray[distance > 0], distance[distance > 0]
+        if not _even(ray, distance):
+            return None
         edge = CELLS[1]
         cell = _cells(ray, edge)
         while edge > CELLS[0] and len(cell) < PER_CELL * len(np.unique(cell)):
@@ -70,7 +72,7 @@ class DepthMap:
         cell, distance = cell[order], distance[order]
         together = cell[1:] == cell[:-1]
         behind = distance[1:][together] > BEHIND * distance[:-1][together]
-        if len(behind) == 0 or behind.mean() > SEVERAL or not _even(ray, np.linalg.norm(ray, axis=1)):
+        if len(behind) == 0 or behind.mean() > SEVERAL:
             return None
         first = np.r_[True, ~together]
         depth = np.full((6, edge, edge), np.inf)

@@ -7,7 +7,15 @@ file and says what to do. Every write is atomic: a failed one leaves the old fil
 from idam.io.cloud import Mesh, PointCloud, Scan
 from idam.io.convert import as_point_cloud
 from idam.io.files import check_destination, check_outputs, make_folder, write_json, write_text
-from idam.io.formats import check_writable, move_file, read_content, read_point_cloud, read_scans, write_point_cloud
+from idam.io.formats import (
+    check_writable,
+    is_readable,
+    move_file,
+    read_content,
+    read_point_cloud,
+    read_scans,
+    write_point_cloud,
+)
 from idam.io.transforms import format_transform, read_transform, rigid_fault, write_transform
 
 __all__ = [
@@ -19,6 +27,7 @@ __all__ = [
     "check_outputs",
     "check_writable",
     "format_transform",
+    "is_readable",
     "make_folder",
     "move_file",
     "read_content",

@@ -31,7 +31,15 @@ from idam.io.files import (
     write_bytes,
 )
 
-__all__ = ["check_writable", "move_file", "read_content", "read_point_cloud", "read_scans", "write_point_cloud"]
+__all__ = [
+    "check_writable",
+    "is_readable",
+    "move_file",
+    "read_content",
+    "read_point_cloud",
+    "read_scans",
+    "write_point_cloud",
+]
 
 log = logging.getLogger("idam.io")
 
@@ -202,6 +210,11 @@ def check_writable(path: StrPath) -> None:
     if suffix == ".e57":
         e57.check_installed()
     check_destination(path)
+
+
+def is_readable(path: StrPath) -> bool:
+    """Whether a file has the extension of a format that can be read."""
+    return _suffix(path) in _DECODERS | _READERS
 
 
 def _read(path: StrPath) -> Content:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,10 @@ from idam.network.similarity import SimilarityConvolution
 
 __all__ = ["IDAM", "Iteration", "KeyPoints", "Output"]
 
+
+STILL = 1e-4
+"""Largest move of a point, in the clouds' unit radii, that ends the iterations: a hundredth of the paper's noise.
+Only past the iterations that have weights of their own: the paper's three are never cut short."""
 
 Graphs = tuple[Tensor, Tensor] | None
 """Neighbours in the source (B, N, K) and in the target (B, P, K)."""
@@ -57,6 +62,21 @@ class Iteration:
         return self.validity_logit.sigmoid()
 
 
+class Clouds(NamedTuple):
+    """B pairs of clouds (B, N, 3) and (B, P, 3), their features, and their neighbours where features have any."""
+
+    source: Tensor
+    target: Tensor
+    source_features: Tensor
+    target_features: Tensor
+    source_neighbours: Tensor | None
+    target_neighbours: Tensor | None
+
+    def pairs(self, rows: Tensor) -> Clouds:
+        """Some of the pairs."""
+        return Clouds(*(None if part is None else part[rows] for part in self))  # type: ignore[arg-type]
+
+
 @dataclass(frozen=True)
 class KeyPoints:
     """What hard elimination leaves of B clouds of N points.
@@ -87,7 +107,8 @@ class Output:
         trust: mean validity of the matches that kept a weight in the last iteration, (B,), in [0, 1].
 
     Where the configuration tries again, each pair has the transform and the trust of its best try; iterations and key
-    points are those of the last try that any pair of the batch took.
+    points are those of the first, which all pairs of a batch take. Iterations end early where none moves a point any
+    more (:data:`STILL`).
     """
 
     rotation: Tensor
@@ -96,6 +117,10 @@ class Output:
     source: KeyPoints
     target: KeyPoints
     trust: Tensor
+
+    def transforms(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations and translations of some of the pairs."""
+        return self.rotation[rows], self.translation[rows]
 
 
 class IDAM(nn.Module):
@@ -131,40 +156,32 @@ class IDAM(nn.Module):
         neighbours = self.graphs(source, target) if neighbours is None else neighbours
         features = self.encode(source, target, neighbours)
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
+        clouds = Clouds(source, target, *features, *(neighbours or (None, None)))
         for keep, onwards in product(self.config.keep_again, (False, True)):
-            if bool((output.trust >= self.config.trusted).all()):
+            rows = (output.trust < self.config.trusted).nonzero().squeeze(-1)
+            if len(rows) == 0:
                 break
-            if onwards:
-                again = self._from_the_best(source, target, features, neighbours, keep, output)
-            else:
-                again = self._from_the_start(source, target, features, keep)
-            output = better(output, again, self.config.trusted)
+            again = self._again(clouds.pairs(rows), keep, output.transforms(rows) if onwards else None)
+            output = better(output, again, rows)
         return output
 
-    def _from_the_start(self, source: Tensor, target: Tensor, features: tuple[Tensor, Tensor], keep: float) -> Output:
-        """Another try, with a share of the points to keep and twice the iterations."""
-        keys = self.eliminate(source, features[0], keep), self.eliminate(target, features[1], keep)
-        return self.match(*keys, 2 * self.config.iterations)
+    def _again(self, clouds: Clouds, keep: float, best: tuple[Tensor, Tensor] | None) -> Output:
+        """Another try, with a share of the points to keep and twice the iterations.
 
-    def _from_the_best(
-        self,
-        source: Tensor,
-        target: Tensor,
-        features: tuple[Tensor, Tensor],
-        neighbours: Graphs,
-        keep: float,
-        best: Output,
-    ) -> Output:
-        """Another try from where the best one led: features that turn with the cloud are more alike there."""
-        moved = apply_transform(source, best.rotation, best.translation)
-        moved_features = features[0]
-        if not self.features.rotation_invariant:
-            moved_features = self.describe(moved, None if neighbours is None else neighbours[0])
-        step = self._from_the_start(moved, target, (moved_features, features[1]), keep)
+        From the start, or from where the best one so far led: features that turn with the cloud are more alike there.
+        """
+        source, features = clouds.source, clouds.source_features
+        if best is not None:
+            source = apply_transform(source, *best)
+            if not self.features.rotation_invariant:
+                features = self.describe(source, clouds.source_neighbours)
+        target_keys = self.eliminate(clouds.target, clouds.target_features, keep)
+        step = self.match(self.eliminate(source, features, keep), target_keys, 2 * self.config.iterations)
+        if best is None:
+            return step
         with torch.autocast(source.device.type, enabled=False):
-            rotation, translation = compose(step.rotation, step.translation, best.rotation, best.translation)
-        keys = replace(step.source, points=gather_points(source, step.source.index))
-        return replace(step, rotation=rotation, translation=translation, source=keys)
+            rotation, translation = compose(step.rotation, step.translation, *best)
+        return replace(step, rotation=rotation, translation=translation)
 
     def graphs(self, source: Tensor, target: Tensor) -> Graphs:
         """The neighbours that features of both clouds are built on, which no rigid motion changes; None without any."""
@@ -209,13 +226,17 @@ class IDAM(nn.Module):
     ) -> list[Iteration]:
         """Match key points (B, M, 3) to (B, L, 3), solve for the step, move the source, and again."""
         iterations: list[Iteration] = []
-        for n in range(self.config.iterations if count is None else count):
+        count = self.config.iterations if count is None else count
+        for n in range(count):
             block = min(n, self.config.blocks - 1)
             maximum, score = self.similarity[block](source, target, source_features, target_features)
             step = self._solve(source, target, score, self.validity[block](maximum))
             iterations.append(step)
             with torch.autocast(source.device.type, enabled=False):
-                source = apply_transform(source, step.rotation, step.translation)
+                moved = apply_transform(source, step.rotation, step.translation)
+            if self.config.blocks <= n + 1 < count and not self.training and is_still(source, moved):
+                break
+            source = moved
         return iterations
 
     @torch.no_grad()
@@ -231,18 +252,21 @@ class IDAM(nn.Module):
         return Iteration(source, score, match, correspondence, validity_logit, weight, rotation, translation)
 
 
-def better(first: Output, second: Output, trusted: float) -> Output:
-    """Both tries as one: for each pair the second, where the first is not trusted and the second is trusted more."""
-    take = (first.trust < trusted) & (second.trust > first.trust)
-    keys = second if bool(take.any()) else first
-    return Output(
-        torch.where(take[:, None, None], second.rotation, first.rotation),
-        torch.where(take[:, None], second.translation, first.translation),
-        keys.iterations,
-        keys.source,
-        keys.target,
-        torch.where(take, second.trust, first.trust),
+def better(first: Output, second: Output, rows: Tensor) -> Output:
+    """Both tries as one: for each pair of the second, which are those rows of the first, the one trusted more."""
+    take = second.trust > first.trust[rows]
+    rows = rows[take]
+    return replace(
+        first,
+        rotation=first.rotation.index_copy(0, rows, second.rotation[take]),
+        translation=first.translation.index_copy(0, rows, second.translation[take]),
+        trust=first.trust.index_copy(0, rows, second.trust[take]),
     )
+
+
+def is_still(before: Tensor, after: Tensor) -> bool:
+    """Whether no point of a batch (B, M, 3) has moved, so that all iterations to come would find the same again."""
+    return bool((after - before).abs().max() < STILL)
 
 
 def chain(iterations: list[Iteration]) -> tuple[Tensor, Tensor]:

@@ -93,10 +93,10 @@ def _together(matches: FeatureMatches, transforms: Array) -> Array:
     return near
 
 
-def _distances(points: Array) -> Array:
+def _distances(points: Array) -> NDArray[np.float32]:
     """Distances (M, M) of points (M, 3) from each other, coordinate by coordinate: an (M, M, 3) array takes longer."""
-    square = np.zeros((len(points), len(points)))
-    for x in points.T:
+    square = np.zeros((len(points), len(points)), np.float32)
+    for x in points.T.astype(np.float32):
         gap = x[:, None] - x
         square += gap * gap
     return np.sqrt(square)

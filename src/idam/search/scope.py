@@ -22,10 +22,12 @@ class Scope:
     Attributes:
         guess: (4, 4).
         max_angle: degrees.
+        given: whether the caller gave the guess, so that it is an answer to consider.
     """
 
     guess: Array
     max_angle: float = 180.0
+    given: bool = False
 
     def within(self, transformations: Array) -> Array:
         """Those of the transforms (S, 4, 4) that are in the scope."""

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from idam import rigid
-from idam.align import reaches
+from idam.align import align, reaches
 from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
@@ -43,6 +43,8 @@ TAUGHT = 90.0
 """Degrees that the pairs which a network of the paper's kind is taught are turned at most."""
 NEAR = 20.0
 """Degrees from such a network's answer within which transforms are looked into."""
+HOMING = 8.0, 4.0, 2.0
+"""Spacings within which points pull on each other from a caller's guess."""
 VERIFIED = 4
 """Answers at most that are refined on the fine clouds before one is chosen."""
 CONTENDS = 0.3
@@ -142,6 +144,8 @@ def choose(
 def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fine: Surfaces) -> Found:
     """What the likeliest of the candidates (S, 4, 4) come to: refined, scored and looked at closely."""
     tried = likeliest(candidates[distinct(candidates, HYPOTHESES)], matching, EXAMINED)
+    if scope.given:
+        tried = np.concatenate([homed(scope.guess, matching)[None], tried])
     answers = ranked(improve(tried, matching, reaches(method)[0], method))
     mistaken = scope.within(slides(matching.clouds.surfaces, answers[0].transformation))
     if len(mistaken):
@@ -149,6 +153,13 @@ def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fi
         answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
     return Found(least_turned(judged(answers[:CONTENDERS], matching, method, fine), scope.guess), matching)
+
+
+def homed(guess: Array, matching: Matching) -> Array:
+    """A guess (4, 4) drawn near from farther away than candidates are, which are nearly right or wrong altogether."""
+    for reach in HOMING:
+        guess = align(matching.clouds.surfaces, guess, reach, "gicp")
+    return guess
 
 
 def judged(answers: list[Answer], matching: Matching, method: str, fine: Surfaces) -> list[Answer]:

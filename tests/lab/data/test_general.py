@@ -22,6 +22,7 @@ from idam.lab.data.general import (
     draw_scans,
     load_meshes,
 )
+from idam.lab.data.own_pairs import OwnPair
 from idam.lab.data.surfaces import random_blob
 from idam.lab.data.working import TOUCHING, ScanPair
 
@@ -126,6 +127,23 @@ def test_scans_are_in_working_coordinates(pairs):
         # the unit is the power of two nearest to the radius of most returns, and a LiDAR's farthest lie beyond
         assert 0.4 < max(core) < 4
         assert max(np.linalg.norm(np.median(cloud, 0)) for cloud in (pair.source, pair.target)) < 1
+
+
+def test_one_s_own_scans_are_half_of_the_pairs_and_keep_their_truth(material, monkeypatch):
+    monkeypatch.setattr(general, "COUNTS", (600,) * 4)
+    rng = np.random.default_rng(0)
+    cloud, far, truth = random_blob(3000, rng), np.array([4e5, 5e6, 100.0]), np.eye(4)
+    truth[:3, :3], truth[:3, 3] = Rotation.random(random_state=rng).as_matrix(), [1, 2, 3]
+    target = (cloud[1000:] + far) @ truth[:3, :3].T + truth[:3, 3]
+    own = dataclasses.replace(material, pairs=[OwnPair(cloud[:2000] + far, target, truth)])
+    drawn = [general._own_scans(own, np.random.default_rng(n)) for n in range(4)]
+    for pair in drawn:
+        near = cdist(aligned(pair), pair.target).min(1)
+        assert np.median(near) < pair.spacing
+    assert all(differ(*both) for both in pairwise(drawn))
+    monkeypatch.setattr(general, "_own_scans", lambda *_: "mine")
+    draws = [draw_scans(own, np.random.default_rng(seed)) for seed in range(12)]
+    assert 2 <= sum(isinstance(draw, str) for draw in draws) <= 10
 
 
 def test_rotations_are_any(pairs):

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from idam import rigid
 from idam.errors import InputError
 from idam.io.files import one_line, silenced
+from idam.lab.data.own_pairs import OwnPair
 from idam.lab.data.practice import make_practice_pairs
 from idam.lab.data.sensor_pairs import draw_part_in_whole, draw_sensor_pair
 from idam.lab.data.surfaces import random_room, random_street, random_thing
@@ -46,6 +47,8 @@ STRAYS = 0.006
 """Largest share of points that are strays, in every third scan."""
 LEAST_OVERLAP, MORE_OVERLAP = 0.05, 0.2
 """A pair is drawn again where it overlaps less than a share drawn from between these."""
+OWN = 0.5
+"""Share of pairs that are one's own scans, where there are any: the rest keeps what other scenes have taught."""
 RANGE = 2.2
 """How far a street's LiDAR sees."""
 SENSED, IN_WHOLE = 0.5, 0.2
@@ -54,10 +57,17 @@ SENSED, IN_WHOLE = 0.5, 0.2
 
 @dataclass(frozen=True)
 class Material:
-    """What surfaces are made of, besides our own: ModelNet40 shapes (S, N, 3), and trimesh meshes."""
+    """What scans are made of, besides our own surfaces.
+
+    Attributes:
+        shapes: of ModelNet40, (S, N, 3).
+        meshes: of trimesh.
+        pairs: real scans with their true transforms.
+    """
 
     shapes: NDArray[np.float32]
     meshes: Sequence[Any] = ()
+    pairs: Sequence[OwnPair] = ()
 
 
 def load_meshes(folder: Path) -> list[Any]:
@@ -88,6 +98,10 @@ def _load_mesh(path: Path) -> Any:
 def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
     """A pair of scans, a function of the generator's state."""
     while True:
+        if material.pairs and rng.random() < OWN:
+            if (own := _own_scans(material, rng)) is not None:
+                return own
+            continue
         pair = _as_sensed(material, rng) if rng.random() < SENSED else _of_dense_points(material, rng)
         if pair is not None and pair.overlap >= rng.uniform(LEAST_OVERLAP, MORE_OVERLAP):
             return pair
@@ -122,6 +136,15 @@ def draw_halves(material: Material, rng: np.random.Generator) -> ScanPair:
     )
     assert scans is not None  # no voxel grid leaves fewer of so few points
     return scans
+
+
+def _own_scans(material: Material, rng: np.random.Generator) -> ScanPair | None:
+    """A pair of real scans in another pose, at some resolution; None where too few points are left."""
+    pair = material.pairs[int(rng.integers(len(material.pairs)))].located(always=True)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    count = int(rng.choice(COUNTS, p=SHARES))
+    return _in_working_coordinates(pair.source @ turn[:3, :3].T, pair.target, pair.transformation @ turn.T, count)
 
 
 def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:

@@ -9,11 +9,12 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from idam.lab.evaluation.methods import METHODS
 from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.record import Missing
 from idam.lab.evaluation.runner import Row
 
-__all__ = ["Board", "columns", "results_table", "short_name"]
+__all__ = ["Board", "columns", "order", "results_table", "short_name"]
 
 WIDTH = 130
 """Columns of a table that is not printed to a terminal."""
@@ -45,6 +46,12 @@ def results_table(experiment: str, rows: list[Row | Missing]) -> Table:
         else:
             table.add_row(*(cell(row) for cell in cells.values()))
     return table
+
+
+def order(method: str) -> float:
+    """Where a method stands in a table: those of one's own, such as the rivals, before the networks of this package."""
+    rows, name = list(METHODS), short_name(method)
+    return rows.index(name) if name in METHODS else rows.index("fpfh-idam-paper") - 0.5
 
 
 def short_name(method: str) -> str:

@@ -56,7 +56,9 @@ def observe(network: IDAM, pairs: Pairs) -> Observed:
     for n in range(len(pairs)):
         pair = pairs[n : n + 1]
         output = network(pair.source, pair.target)
-        errors.append(iteration_errors(output, pair.rotation))
+        found = iteration_errors(output, pair.rotation)
+        left_out = 1 + network.config.iterations - found.shape[1]  # where no point moved any more
+        errors.append(torch.cat([found, found[:, -1:].expand(-1, left_out)], 1))
         validity.append(output.iterations[-1].validity)
         right.append(right_matches(output, pair.rotation, pair.translation))
     return Observed(torch.cat(errors), torch.cat(validity), torch.cat(right))

@@ -22,6 +22,7 @@ from idam.describe.invariant import Surroundings, surroundings
 from idam.errors import InputError
 from idam.lab.data.general import Material, draw_halves, draw_scans, load_meshes
 from idam.lab.data.modelnet40 import load
+from idam.lab.data.own_pairs import read_own_pairs
 from idam.lab.data.working import ScanPair
 from idam.lab.training.batches import VALIDATION_SEED, generator_at
 from idam.lab.training.checkpoint import initial_model
@@ -173,7 +174,12 @@ class GeneralTask:
         self.recipe = recipe
         shapes, meshes = load(data, "train").points.numpy(), load_meshes(Path(data) / "meshes")
         taught, held = (np.arange(len(shapes)) % HELD != 0), (np.arange(len(shapes)) % HELD == 0)
-        self.material = Material(shapes[taught], [mesh for n, mesh in enumerate(meshes) if n % HELD])
+        own = [] if recipe.pairs is None else read_own_pairs(recipe.pairs).pairs
+        self.material = Material(
+            shapes[taught],
+            [mesh for n, mesh in enumerate(meshes) if n % HELD],
+            [pair for n, pair in enumerate(own) if n % HELD] or own,  # a single pair is worth learning, too
+        )
         self.module = GeneralStep(initial_model(recipe))
         self.size = PAIRS[recipe.experiment]
         surfaces = f"our own surfaces, ModelNet40's training split and {len(meshes)} meshes"
@@ -181,7 +187,9 @@ class GeneralTask:
             surfaces = "ModelNet40's training split"
         self.data = f"{self.size} pairs of scans of {surfaces}"
         self.held = f"{VALIDATION_PAIRS} pairs of scans, an eighth of the shapes and meshes held out for them"
-        kept = Material(shapes[held], meshes[::HELD])
+        if own:
+            self.data += f", half of them {len(own)} pairs of {recipe.pairs}"
+        kept = Material(shapes[held], meshes[::HELD], own[::HELD])
         draw = draw_scans if recipe.experiment == "general" else draw_halves
         # of indices that no training reaches, whatever its seed
         self.pairs = [scanned(draw, kept, VALIDATION_SEED, self.size + n) for n in range(VALIDATION_PAIRS)]

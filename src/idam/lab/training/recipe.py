@@ -35,6 +35,8 @@ class Recipe:
         eliminate: let hard elimination choose the target points, and half of the source points, as it does after
             training; balanced sampling chooses the other half.
         start: name or file of a model, or a ``last.ckpt``, whose weights to start from; None for random ones.
+        pairs: file of one's own pairs (:func:`idam.lab.data.own_pairs.read_own_pairs`), half of what general training
+            draws.
         seed: of the weights, pairs and samples.
     """
 
@@ -51,6 +53,7 @@ class Recipe:
     iterations: int = 3
     eliminate: bool = False
     start: str | None = None
+    pairs: str | None = None
     seed: int = 0
 
     @property
@@ -78,6 +81,8 @@ def check(recipe: Recipe) -> None:
     """Raise InputError where a recipe makes no sense."""
     if recipe.experiment not in TRAININGS:
         raise InputError(f"unknown experiment {recipe.experiment!r}: choose {', '.join(TRAININGS)}")
+    if recipe.pairs is not None and recipe.experiment != "general":
+        raise InputError("your own --pairs are for general training: choose general, or leave --pairs out")
     if recipe.schedule not in ("step", "one-cycle"):
         raise InputError(f"unknown schedule {recipe.schedule!r}: choose step or one-cycle")
     positive = (recipe.epochs, recipe.learning_rate, recipe.radius)

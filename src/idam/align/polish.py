@@ -1,0 +1,89 @@
+"""The last stage: a nearly right transform made as precise as the points allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from idam import rigid
+from idam.align.methods import copies
+from idam.align.patches import Dense, Pairs, patch_size
+from idam.clouds.surfaces import Surfaces
+from idam.rigid import Array
+
+__all__ = ["finished", "polish"]
+
+ITERATIONS = 12
+"""At most."""
+STILL = 1e-6
+"""Length of a step, in radians and working units, from which on it is done."""
+FEWEST = 30
+"""Pairs of patches below which the start stays."""
+FARTHEST = 3.0
+"""Spacings by which it may move the source's points (root mean square): more is not polishing, and the start stays."""
+
+
+def finished(
+    surfaces: Surfaces, dense: Callable[[], tuple[Dense, Dense]], start: Array, method: str, last: bool
+) -> tuple[Array, Pairs]:
+    """The transform to give, and the pairs that its precision is told by.
+
+    Args:
+        surfaces: that the transform was refined on.
+        dense: makes both clouds with as many points as there are.
+        start: (4, 4), as the method left it.
+        method: that refined it. Copies of points, which only the symmetric one looks for, hold each other every way.
+        last: whether to :func:`polish`.
+    """
+    if method == "symmetric" and copies(surfaces, start):
+        return start, Pairs.of_points(surfaces, start).each_way()
+    return polish(surfaces, *dense(), start) if last else (start, Pairs.of_points(surfaces, start))
+
+
+def polish(surfaces: Surfaces, source: Dense, target: Dense, start: Array) -> tuple[Array, Pairs]:
+    """Lay points of both surfaces on each other and then, where noise goes past the spacing, means of many points.
+
+    Args:
+        surfaces: in working coordinates, thinned.
+        source: as many of its points as there are, not thinned by voxels: the mean of a voxel that noise just reaches
+            weighs as much as that of a full one, and whole walls are off by a part of the noise.
+        target: likewise.
+        start: (4, 4), off by less than the spacing of the surfaces' points.
+
+    Returns:
+        The transform (4, 4), and the pairs under it that fixed it.
+    """
+    found = _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
+    places = surfaces.source.points
+    size = max(patch_size(source, places), patch_size(target, surfaces.target.points))
+    if size == 1:
+        return found
+    patches, _, _ = source.patches(places, size)
+    return _settled(lambda at: Pairs.of_patches(patches, target, at, size), found[0], surfaces.spacing)
+
+
+def _settled(pairs_of: Callable[[Array], Pairs], start: Array, spacing: float) -> tuple[Array, Pairs]:
+    """Gauss and Newton from a start (4, 4) until the step is still."""
+    first = pairs = pairs_of(start)
+    transformation = start
+    for _ in range(ITERATIONS):
+        if len(pairs.points) < FEWEST:
+            return start, first
+        step = _step(pairs)
+        transformation = transformation @ rigid.exp(step)
+        pairs = pairs_of(transformation)
+        if np.abs(step).max() < STILL:
+            break
+    moved = rigid.apply(transformation, first.points) - rigid.apply(start, first.points)
+    if len(pairs.points) < FEWEST or not np.sqrt((moved**2).sum(1).mean()) <= FARTHEST * spacing:
+        return start, first
+    return transformation, pairs
+
+
+def _step(pairs: Pairs) -> Array:
+    """Of Gauss and Newton, (6,)."""
+    gradient = pairs.gradients(pairs.normals)
+    weighted = gradient * pairs.weights[:, None]
+    # as of one pair each: where nothing holds, it stays
+    return np.linalg.solve(weighted.T @ gradient + np.eye(6), -(weighted.T @ pairs.residuals))

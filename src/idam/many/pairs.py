@@ -1,0 +1,200 @@
+"""Registering pairs of scans, on as many cores as wanted, each pair once: what is done is kept."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from idam import rigid
+from idam.clouds.prepared import Prepared
+from idam.errors import InputError
+from idam.io.files import StrPath, one_line
+from idam.many.scans import Scan
+from idam.rigid import Array
+
+__all__ = ["Kept", "Pair", "register_pairs"]
+
+Pair = tuple[int, int]
+"""Numbers of a source and a target."""
+Row = dict[str, Any]
+"""What is known of a registered pair, as plain numbers and lists."""
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
+
+@dataclass
+class Kept:
+    """Registered pairs in a file of JSON lines, one appended as soon as it is done; without a file, in memory.
+
+    A run that was stopped finds what it had: a line is found by the fingerprints of its scans and the options, and one
+    that was cut short is no line.
+
+    Attributes:
+        path: the file, or None.
+    """
+
+    path: StrPath | None = None
+    rows: dict[str, Row] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.path is None:
+            return
+        try:
+            text = Path(self.path).read_text("utf-8") if Path(self.path).exists() else ""
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{self.path}: cannot be read ({one_line(error)}): remove it, or write elsewhere"
+            ) from None
+        for line in text.split("\n")[:-1]:  # what follows the last line's end was cut short
+            try:
+                row = json.loads(line)
+                self.rows[row["key"]] = row
+            except (ValueError, TypeError, KeyError):
+                continue
+        if text and not text.endswith("\n"):
+            self._append("\n")
+
+    def add(self, key: str, row: Row) -> None:
+        """Keep a row under a key."""
+        self.rows[key] = {"key": key, **row}
+        if self.path is not None:
+            self._append(json.dumps(self.rows[key]) + "\n")
+
+    def _append(self, text: str) -> None:
+        assert self.path is not None
+        try:
+            with Path(self.path).open("a", encoding="utf-8") as stream:
+                stream.write(text)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written ({one_line(error)}): write elsewhere") from None
+
+
+def register_pairs(
+    scans: Sequence[Scan],
+    pairs: Sequence[Pair],
+    options: dict[str, Any],
+    guesses: Mapping[int, Array],
+    kept: Kept,
+    jobs: int,
+    progress: Callable[[str, int, int], None],
+) -> dict[Pair, Row]:
+    """Register pairs of scans, less those that are kept already.
+
+    Args:
+        scans: all of them.
+        pairs: their numbers.
+        options: of :func:`idam.register`.
+        guesses: starting poses (4, 4) by scan, all to one frame.
+        kept: what is known already, and where the rest goes.
+        jobs: processes.
+        progress: called with what is done, and how many of how many.
+
+    Returns:
+        A row for each pair: what registered, or the one line that says why it did not.
+
+    Raises:
+        InputError: a process was killed.
+    """
+    asked = {pair: options | guess(pair, guesses) for pair in pairs}
+    keys = {pair: key_of(scans[pair[0]], scans[pair[1]], asked[pair]) for pair in pairs}
+    waiting = [pair for pair in pairs if keys[pair] not in kept.rows]
+    ready = len(pairs) - len(waiting)
+    progress("pairs registered", ready, len(pairs))
+    for pair, row in results(scans, {pair: asked[pair] for pair in waiting}, min(jobs, len(waiting))):
+        kept.add(keys[pair], {"source": scans[pair[0]].name, "target": scans[pair[1]].name, **row})
+        ready += 1
+        progress("pairs registered", ready, len(pairs))
+    return {pair: kept.rows[keys[pair]] for pair in pairs}
+
+
+def key_of(source: Scan, target: Scan, options: dict[str, Any]) -> str:
+    """What a registration depends on."""
+    from idam import __version__
+
+    return "-".join([source.fingerprint, target.fingerprint, __version__, json.dumps(options, sort_keys=True)])
+
+
+def guess(pair: Pair, guesses: Mapping[int, Array]) -> dict[str, Any]:
+    """The option that says where to begin, where both scans have starting poses."""
+    source, target = (guesses.get(scan) for scan in pair)
+    return {} if source is None or target is None else {"init": (rigid.inverse(target) @ source).tolist()}
+
+
+def results(scans: Sequence[Scan], asked: Mapping[Pair, dict[str, Any]], jobs: int) -> Iterator[tuple[Pair, Row]]:
+    """Each pair's row, as soon as it is done."""
+    if jobs <= 1:
+        begin([scan.prepared for scan in scans])
+        for pair, options in asked.items():
+            yield pair, register_pair(pair, options)
+        return
+    with (
+        one_thread_each(),
+        ProcessPoolExecutor(jobs, get_context("spawn"), begin, ([portable(scan.prepared) for scan in scans],)) as pool,
+    ):
+        futures = {pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool:
+            raise InputError(
+                "a process was killed, probably for want of memory: run again with fewer jobs; what is done is kept"
+            ) from None
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """New processes with a thread each for linear algebra: they share the cores."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def portable(cloud: Prepared) -> Prepared:
+    """A prepared cloud without what cannot be sent to another process and is quickly made again there."""
+    return replace(cloud, levels={size: replace(level, _surfaces={}) for size, level in cloud.levels.items()})
+
+
+_scans: list[Any] = []
+"""In each process: all scans, ready to be registered."""
+
+
+def begin(scans: list[Any]) -> None:
+    """Hand a process the scans."""
+    _scans[:] = scans
+
+
+def register_pair(pair: Pair, options: dict[str, Any]) -> Row:
+    """Register one pair of the scans that :func:`begin` handed over; what goes wrong is in the row."""
+    import idam
+
+    try:
+        result = idam.register(_scans[pair[0]], _scans[pair[1]], **options)
+    except Exception as error:  # a bad pair must not cost the others
+        return {"error": one_line(error)}
+    return {
+        "error": "",
+        "transformation": result.transformation.tolist(),
+        "information": result.information.tolist(),
+        "confidence": result.confidence,
+        "reason": result.reason,
+        "overlap": result.fitness,
+        "residual": result.inlier_rmse,
+        "reach": result.max_correspondence_distance,
+    }

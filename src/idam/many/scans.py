@@ -1,0 +1,160 @@
+"""The scans to merge: read, named, and made ready."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from idam import io, rigid
+from idam.clouds.prepared import SMALL, Prepared
+from idam.clouds.surfaces import Surface
+from idam.errors import InputError, MissingDependencyError
+from idam.io import PointCloud, as_point_cloud, is_readable
+from idam.models import resolve
+from idam.registration import prepared
+from idam.rigid import Array
+
+__all__ = ["Scan", "Thinned", "described", "read_scans", "thinned"]
+
+THINNED = 5000
+"""Points of a scan at most that the joint refinement uses."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan that can be registered.
+
+    Attributes:
+        name: what messages and files call it.
+        cloud: as given.
+        prepared: all that depends on it alone.
+    """
+
+    name: str
+    cloud: PointCloud
+    prepared: Prepared
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Tells this scan's points from any other's."""
+        return hashlib.sha256(np.ascontiguousarray(self.cloud.points).tobytes()).hexdigest()[:16]
+
+    @property
+    def to_centre(self) -> Array:
+        """The transform (4, 4) from coordinates relative to the centre to the scan's own."""
+        return rigid.transform(np.eye(3), self.prepared.centre)
+
+
+@dataclass(frozen=True, eq=False)
+class Thinned:
+    """A scan on a voxel grid, relative to its centre, in working units.
+
+    Attributes:
+        surface: with covariances and a search tree.
+        spacing: the median distance of neighbouring points.
+    """
+
+    surface: Surface
+    spacing: float
+
+    @property
+    def points(self) -> Array:
+        """(N, 3)."""
+        return self.surface.points
+
+
+def thinned(scans: Sequence[Scan], unit: float) -> list[Thinned]:
+    """All scans on one grid, that of the scan which needs the largest voxels."""
+    voxel_size = max(scan.prepared.voxel_size(THINNED) for scan in scans)
+    levels = [scan.prepared.level(voxel_size) for scan in scans]
+    return [Thinned(level.surface(unit), level.spacing / unit) for level in levels]
+
+
+def described(scans: Sequence[Scan]) -> tuple[list[Array], list[NDArray[np.float32]], float]:
+    """Points (N, 3) and features (N, K) of all scans on one grid, and the spacing of the points."""
+    descriptor = resolve("default").descriptor
+    voxel_size = float(np.median([scan.prepared.voxel_size(SMALL) for scan in scans]))
+    levels = [scan.prepared.level(voxel_size) for scan in scans]
+    rung = int(np.median([level.spacing_rung for level in levels]))
+    spacing = float(np.median([level.spacing for level in levels]))
+    return [level.points for level in levels], [level.described(descriptor, rung) for level in levels], spacing
+
+
+def read_scans(scans: Iterable[Any], strict: bool = False) -> tuple[list[str], list[Scan | str]]:
+    """Read the scans, and check that each can be registered.
+
+    Args:
+        scans: paths, folders, or what :func:`idam.register` takes. A file of several scans stands for all of them.
+        strict: whether a scan that cannot be used is an error.
+
+    Returns:
+        The names of all scans, and for each the scan, or in one line why there is none.
+
+    Raises:
+        InputError: there are no two scans, two have one name, or, if strict, one cannot be used.
+    """
+    names: list[str] = []
+    read: list[Scan | str] = []
+    for name, load in sources(scans):
+        found: list[Scan | str] = []
+        try:
+            found += [ready(*each) for each in load()]
+        except (InputError, MissingDependencyError) as error:
+            if strict:
+                raise
+            found = [str(error) if name in str(error) else f"{name}: {error}"]
+        names += [scan.name if isinstance(scan, Scan) else name for scan in found]
+        read += found
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{name}: {names.count(name)} scans have this name: rename them, or give each just once")
+    usable = sum(isinstance(scan, Scan) for scan in read)
+    if usable < 2:
+        faults = "".join(f"; {scan}" for scan in read if isinstance(scan, str))
+        raise InputError(f"merging takes at least 2 scans that can be used, here are {usable}{faults}")
+    return names, read
+
+
+def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple[str, Any]]]]]:
+    """What each entry is called, and how its scans are read, each with its name.
+
+    A file is called by its name without the folder, anything else by its number; a folder stands for the files in it.
+    """
+    if isinstance(scans, (str, os.PathLike)):
+        scans = [scans]
+    for number, data in enumerate(scans):
+        if isinstance(data, (str, os.PathLike)):
+            for file in clouds_in(Path(data)) if Path(data).is_dir() else [Path(data)]:
+                yield file.name, partial(scans_of, file)
+        else:
+            name = f"scan{number:03d}"
+            yield name, partial(list, [(name, data)])
+
+
+def scans_of(file: Path) -> list[tuple[str, Any]]:
+    """The scans of a file, with their names."""
+    return [(scan.name, scan.cloud) for scan in io.read_scans(file)]
+
+
+def ready(name: str, data: Any) -> Scan:
+    """A scan with all that depends on it alone; raise InputError where it cannot be registered."""
+    if isinstance(data, Prepared):
+        return Scan(name, PointCloud(data.points), data)
+    cloud = as_point_cloud(data, nan="drop")
+    return Scan(name, cloud, prepared(cloud.points, name))
+
+
+def clouds_in(folder: Path) -> list[Path]:
+    """The point clouds in a folder, in the order of their names."""
+    files = sorted(file for file in folder.iterdir() if is_readable(file) and file.is_file())
+    if not files:
+        raise InputError(f"{folder}: holds no file of a point cloud: name the scans themselves")
+    return files
