@@ -150,6 +150,19 @@ def test_info_guesses_the_unit(work: Path, call: Call, points: np.ndarray, words
     assert words in call("info", "a.xyz").out
 
 
+# --- view ----------------------------------------------------------------------------------------------------------
+
+
+def test_view_writes_a_page_without_a_judgement(work: Path, call: Call) -> None:
+    code, out, err = call("view", "source.ply", "target.xyz", "T.txt", "--no-open")
+    assert (code, out, err) == (0, "look at view.html\n", "")
+    page = Path("view.html").read_text()
+    assert '<body class="unjudged">' in page and "source.ply" in page and "100.0 %" in page and "{{" not in page
+    call("view", "source.ply", "target.xyz", "-o", "apart.html", "--no-open")
+    assert "100.0 %" not in Path("apart.html").read_text()
+    assert_refused(call("view", "source.ply", "target.xyz", "-o", "source.ply"), "would overwrite an input")
+
+
 # --- register ------------------------------------------------------------------------------------------------------
 
 
