@@ -186,6 +186,15 @@ def test_register_overwrites_no_input_and_no_other_output(work: Path, call: Call
     assert {path.name: path.read_bytes() for path in work.iterdir()} == before
 
 
+def test_register_names_the_file_at_fault(work: Path, call: Call) -> None:
+    Path("few.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n")
+    assert_refused(call("register", "source.ply", "few.xyz"), "few.xyz: has 3 points")
+    assert_refused(call("register", "few.xyz", "source.ply"), "few.xyz: has 3 points")
+    Path("nan.csv").write_text("name,x,y,z\nP,nan,0,0\n" + "".join(f"a,{x},{x * x % 7},{x % 5}\n" for x in range(40)))
+    run = call("register", "nan.csv", "nan.csv", "-v")
+    assert "left out columns that hold text: name" in run.err and "left out 1 points" in run.err
+
+
 def test_register_json_is_json_under_any_name(work: Path, call: Call) -> None:
     assert call("register", "source.ply", "target.xyz", "--json", "r.txt").code == 0
     assert "confidence" in json.loads(Path("r.txt").read_text())

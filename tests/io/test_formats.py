@@ -408,6 +408,19 @@ def test_e57_is_written_with_poses_and_far_from_the_origin(tmp_path: Path) -> No
         np.testing.assert_allclose(after.placed().points, rigid.apply(MOTION, before.placed().points), atol=1e-6)
 
 
+def test_e57_of_spherical_coordinates() -> None:
+    from idam.io.e57 import _points
+
+    columns = {"sphericalRange": [2.0, 3], "sphericalAzimuth": [0.5, 0], "sphericalElevation": [0.25, np.pi / 2]}
+    found = _points({name: np.array(values) for name, values in columns.items()}, 1)
+    flat = 2 * np.cos(0.25)
+    np.testing.assert_allclose(
+        found, [[flat * np.cos(0.5), flat * np.sin(0.5), 2 * np.sin(0.25)], [0, 0, 3]], atol=1e-15
+    )
+    with pytest.raises(InputError, match="scan 1 has no coordinates"):
+        _points({"intensity": np.zeros(2)}, 1)
+
+
 def test_e57_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pye57")
     e57_file(tmp_path / "a.e57", e57_scan())
