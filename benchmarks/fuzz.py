@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1] / "tests" / "test_fuzz.py"
-EXAMPLES = re.compile(r"(\d+) passing examples, (\d+) failing examples")
+EXAMPLES = re.compile(r"(\d+) passing(?: examples)?, (\d+) failing")
 
 
 def main() -> None:
