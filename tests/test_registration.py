@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from idam.search.judge import CONVERGED, confidence
 
 import idam
 from idam import RegistrationResult, rigid
@@ -21,6 +20,7 @@ from idam.clouds.prepared import Prepared
 from idam.errors import InputError
 from idam.io import PointCloud, read_point_cloud, write_point_cloud
 from idam.registration import as_rigid
+from idam.search.judge import CONVERGED, confidence
 from idam.search.matching import FOR
 from motions import any_rotation, degrees, move
 from motions import rigid as motion

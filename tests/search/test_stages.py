@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from idam.search.judge import CONVERGED, confidence, weight
 
 from idam.clouds.prepared import Prepared
 from idam.clouds.pyramid import Pyramid
 from idam.describe.invariant import Descriptor, Surroundings
+from idam.search.judge import CONVERGED, confidence, weight
 from idam.search.matching import FeatureMatches
 from idam.search.ranking import Answer, same
 from idam.search.scope import Scope
