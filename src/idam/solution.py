@@ -96,8 +96,9 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle, given=guess is not None)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
-    start = align(surfaces, found.best, reaches(method)[1], method)
-    best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last=refine == "gicp")
+    last = refine == "gicp"  # unless another method is asked for, the last stage takes over from the search
+    start = found.best if last and method != "symmetric" else align(surfaces, found.best, reaches(method)[1], method)
+    best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last)
     poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
     return Solution(
         answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],

@@ -16,7 +16,7 @@ __all__ = ["finished", "polish"]
 
 ITERATIONS = 12
 """At most."""
-STILL = 1e-6
+STILL = 5e-6
 """Length of a step, in radians and working units, from which on it is done."""
 FEWEST = 30
 """Pairs of patches below which the start stays."""
