@@ -56,7 +56,7 @@ def inflation(pairs: Pairs, gradient: Array, fixed: Array) -> float:
     blocks, unknowns = pull.shape
     scatter = float(np.einsum("bi,ij,bj->", pull, np.linalg.inv(fixed), pull)) / unknowns
     # the unknowns that were fitted leave the sums so much too small
-    return max(scatter * blocks / max(blocks - unknowns, 1), 1e-18)
+    return float(max(scatter * blocks / max(blocks - unknowns, 1), 1e-18))
 
 
 def _blocks(points: Array, size: float) -> NDArray[np.int64]:
