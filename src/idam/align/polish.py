@@ -14,7 +14,7 @@ from idam.rigid import Array
 
 __all__ = ["finished", "polish"]
 
-ITERATIONS = 12
+ITERATIONS = 6
 """At most."""
 STILL = 5e-6
 """Length of a step, in radians and working units, from which on it is done."""
@@ -40,13 +40,10 @@ def finished(
         return start, Pairs.of_points(surfaces, start).each_way()
     if not last:
         return start, Pairs.of_points(surfaces, start)
-    # of sparse clouds, patches reach past edges: a room of 1000 points ends five times as far off
-    return polish(surfaces, start, dense if method != "symmetric" else None)
+    return polish(surfaces, start, dense)
 
 
-def polish(
-    surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Dense, Dense]] | None = None
-) -> tuple[Array, Pairs]:
+def polish(surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Dense, Dense]]) -> tuple[Array, Pairs]:
     """Lay points of both surfaces on each other and then, where noise goes past the spacing, means of many points.
 
     Args:
@@ -54,14 +51,12 @@ def polish(
         start: (4, 4), off by less than the spacing of the surfaces' points.
         dense: makes source and target with as many of their points as there are, not thinned by voxels: the mean of a
             voxel that noise just reaches weighs as much as that of a full one, and whole walls are off by a part of the
-            noise. None for points alone.
+            noise.
 
     Returns:
         The transform (4, 4), and the pairs under it that fixed it.
     """
     found = _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
-    if dense is None:
-        return found
     source, target = dense()
     places = surfaces.source.points
     size = max(patch_size(source, places), patch_size(target, surfaces.target.points))
