@@ -6,6 +6,7 @@ import numpy as np
 
 from idam.clouds.prepared import ALL, Level
 from idam.clouds.pyramid import PairLevel
+from idam.clouds.viewpoint import FreeSpace
 from idam.clouds.voxels import downsample, ladder, rung_for
 from idam.search.matching import FeatureMatches, Matching
 from motions import move
@@ -33,8 +34,8 @@ def swapped(matches: FeatureMatches) -> FeatureMatches:
 
 
 def level(source: np.ndarray, target: np.ndarray) -> PairLevel:
-    """Two clouds as they are."""
-    return PairLevel(Level(source, ALL), Level(target, ALL), 1.0)
+    """Two clouds as they are, of which nobody knows where they were seen from."""
+    return PairLevel(Level(source, ALL), Level(target, ALL), 1.0, FreeSpace(source, target, None, None, 0.0))
 
 
 def thinned(points: np.ndarray, count: int) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from idam.search.confidence import CLOSE, CONVERGED, confidence
 
 import idam
 from idam import RegistrationResult, rigid
@@ -20,7 +21,6 @@ from idam.clouds.prepared import Prepared
 from idam.errors import InputError
 from idam.io import PointCloud, read_point_cloud, write_point_cloud
 from idam.registration import as_rigid
-from idam.search.confidence import CLOSE, CONVERGED, confidence
 from idam.search.matching import FOR
 from motions import any_rotation, degrees, move
 from motions import rigid as motion

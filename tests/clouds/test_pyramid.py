@@ -9,6 +9,7 @@ from idam import rigid
 from idam.clouds.frame import MIN_POINTS
 from idam.clouds.prepared import FINE, LARGER, SMALL, Prepared
 from idam.clouds.pyramid import FINEST, MOST_POINTS, PairLevel, Pyramid
+from idam.describe.invariant import Surroundings
 from idam.errors import InputError
 from motions import any_rotation, move
 from solids import noise, shell, spacing_by_definition
@@ -101,14 +102,16 @@ def test_both_clouds_are_described_at_one_spacing(large: Pyramid) -> None:
     class Noted:
         key = "noted"
 
-        def __call__(self, points: np.ndarray, spacing: float) -> np.ndarray:
-            asked.append(spacing)
-            return np.zeros((len(points), 2), np.float32)
+        def describe(self, around: Surroundings) -> np.ndarray:
+            asked.append(spacing_by_definition(around.points))
+            return np.zeros((len(around.points), 2), np.float32)
 
     source, target = large.small.features(Noted())
     assert (len(source), len(target)) == (len(large.small.source), len(large.small.target))
-    assert len(asked) == 2
-    assert asked[0] == asked[1] == pytest.approx(large.small.spacing * large.unit, rel=0.1)
+    # the points are in spacings of the sparser cloud
+    assert max(asked) == pytest.approx(1.0, rel=0.1)
+    both = [spacing_by_definition(points) for points in (large.small.source, large.small.target)]
+    assert asked[0] / asked[1] == pytest.approx(both[0] / both[1], rel=1e-5)
 
 
 # --- voxel_size ----------------------------------------------------------------------------------------------------

@@ -399,7 +399,9 @@ def test_e57_is_written_with_poses_and_far_from_the_origin(tmp_path: Path) -> No
     np.testing.assert_allclose(back.points, cloud.points, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(back.colors, cloud.colors)
     np.testing.assert_array_equal(back.attributes["intensity"], cloud.attributes["intensity"])
-    e57_file(tmp_path / "b.e57", e57_scan(), e57_scan(seed=1, translation=np.ones(3), rotation=np.array([1.0, 0, 0, 0])))
+    e57_file(
+        tmp_path / "b.e57", e57_scan(), e57_scan(seed=1, translation=np.ones(3), rotation=np.array([1.0, 0, 0, 0]))
+    )
     move_file(tmp_path / "b.e57", MOTION, tmp_path / "c.e57")
     for before, after in zip(read_scans(tmp_path / "b.e57"), read_scans(tmp_path / "c.e57"), strict=True):
         np.testing.assert_allclose(after.placed().points, rigid.apply(MOTION, before.placed().points), atol=1e-6)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from idam.search.confidence import CLOSE, LITTLE, SLIGHT, Evidence, confidence, doubt, features
 
 CLEAR = Evidence(overlap=0.95, support=0.7, likelihood=3.0, margin=0.9)

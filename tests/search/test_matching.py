@@ -9,6 +9,7 @@ import pytest
 
 from idam.clouds.pyramid import PairLevel
 from idam.clouds.surfaces import SAME_SURFACE, TOUCHING
+from idam.describe.invariant import Surroundings
 from idam.search import matching as module
 from idam.search.consensus import agreeing_transforms
 from idam.search.matching import AGAINST, FEW, FOR, MATCHES, REACH, FeatureMatches, Matching, mutual_matches
@@ -158,7 +159,7 @@ class Given:
     def __init__(self, *features: np.ndarray) -> None:
         self.features = [x.astype(np.float32) for x in features]
 
-    def __call__(self, points: np.ndarray, spacing: float) -> np.ndarray:
+    def describe(self, around: Surroundings) -> np.ndarray:
         return self.features.pop(0)
 
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence
 
 from idam.clouds.prepared import Describes, Prepared
 from idam.clouds.pyramid import Pyramid
-from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence
 from idam.search.matching import FeatureMatches
 from idam.search.ranking import Answer, same
 from idam.search.scope import Scope
