@@ -81,8 +81,8 @@ def register(
     check_outputs(outputs, [path for path in (source, target, init) if path is not None])
     if save_plot is not None:
         check_drawable(save_plot)
-    source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
-    with steps_told(verbose):
+    with steps_told(verbose), faults_named(source, target):
+        source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
         result = registration.register(
             source_cloud,
             target_cloud,
@@ -124,6 +124,19 @@ def check_drawable(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"{path}: unknown picture format '{path.suffix}': the ones to draw are .png, .svg")
     check_matplotlib("a result")
+
+
+@contextmanager
+def faults_named(source: Path, target: Path) -> Iterator[None]:
+    """Name the file in what is wrong with the source or the target."""
+    try:
+        yield
+    except InputError as error:
+        name, colon, what = str(error).partition(": ")
+        file = {"source": source, "target": target}.get(name)
+        if file is None:
+            raise
+        raise InputError(f"{file}{colon}{what}") from error
 
 
 @contextmanager
