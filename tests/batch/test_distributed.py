@@ -9,13 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from cheap import Cheap, settled
-from processes import count, descendants, processes, start, until
 
+from cheap import Cheap, settled
 from idam.batch import distributed
 from idam.batch.ledger import read_run
 from idam.batch.pairs import as_pairs
 from idam.errors import MissingDependencyError
+from killing import count, descendants, processes, start, until
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray: pip install 'idam[ray]'")
 
