@@ -50,11 +50,6 @@ def blocks(page: str, *languages: str) -> list[Block]:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_python_blocks_run_one_after_the_other(scans: Path, page: str) -> None:
-    text = (ROOT / page).read_text(encoding="utf-8")
-    if "write_plot" in text:
-        pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
-    if "load_model" in text:
-        pytest.importorskip("torch", reason="networks need PyTorch: pip install 'idam[torch]'")
     namespace: dict[str, Any] = {"__name__": "__main__"}
     found = blocks(page, "python")
     assert found
