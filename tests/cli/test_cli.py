@@ -22,7 +22,7 @@ from idam import RegistrationResult, cli, registration
 from idam.io import PointCloud, format_transform, read_point_cloud, read_transform, write_point_cloud
 from idam.report import view
 from idam.weights import provenance
-from motions import degrees, rigid
+from motions import degrees, rotation
 
 
 class Run(NamedTuple):
@@ -44,7 +44,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud = PointCloud(points, random.integers(0, 256, (300, 3), dtype=np.uint8), normals)
     folder = tmp_path_factory.mktemp("scans")
     write_point_cloud(folder / "source.ply", cloud)
-    write_point_cloud(folder / "target.xyz", points @ rigid([0.4, 1.1, -0.3], [0, 0, 0])[:3, :3].T + 3.0)
+    write_point_cloud(folder / "target.xyz", points @ rotation([0.4, 1.1, -0.3]).T + 3.0)
     return folder
 
 
@@ -322,6 +322,14 @@ def test_refuses_options(work: Path, call: Call, option: str, value: str, words:
     assert files_in(work) == before
 
 
+@pytest.mark.parametrize("device", ["abacus", "cuda:99"])
+def test_refuses_devices_that_a_network_cannot_run_on(work: Path, call: Call, device: str) -> None:
+    pytest.importorskip("torch", reason="the paper's networks need PyTorch: pip install 'idam[torch]'")
+    model = ("--model", "gnn-unseen-shapes")
+    assert_refused(call("register", "source.ply", "target.xyz", "-o", "out.ply", *model, "--device", device), device)
+    assert not (work / "out.ply").exists()
+
+
 OUTPUTS = {"-o": "a.ply", "--transform": "a.txt", "--json": "a.json", "--html": "a.html", "--save-plot": "a.png"}
 
 
@@ -411,7 +419,8 @@ def test_demo_writes_its_files(tmp_path: Path) -> None:
     matrix = read_transform(next(folder.glob("*.txt")))
     np.testing.assert_array_equal(printed_matrix(run.out), matrix)
     truth = np.loadtxt(str(resources.files("idam.lab.data") / "demo" / "truth.txt"))
-    source = read_point_cloud(str(resources.files("idam.demo") / "source.ply"))
+    with resources.as_file(resources.files("idam.demo") / "source.ply") as shipped:
+        source = read_point_cloud(shipped)
     assert degrees(matrix, truth) < 5.0
     aligned = read_point_cloud(next(folder.glob("*.ply")))
     np.testing.assert_allclose(aligned.points, source.transformed(matrix).points, atol=1e-5)
