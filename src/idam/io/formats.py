@@ -192,7 +192,9 @@ def move_file(source: StrPath, transformation: ArrayLike, output: StrPath) -> No
             _write_scans(output, [Scan(scan.name, scan.cloud, matrix @ _pose(scan)) for scan in scans])
             return
         content = joined([scan.placed() for scan in scans])
-    _write(output, content.transformed(matrix))
+    with np.errstate(all="ignore"):  # of damaged normals
+        moved_content = content.transformed(matrix)
+    _write(output, moved_content)
 
 
 def check_writable(path: StrPath) -> None:
