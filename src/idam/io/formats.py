@@ -30,6 +30,7 @@ from idam.io.files import (
     read_bytes,
     write_bytes,
 )
+from idam.io.transforms import rigid_fault
 
 __all__ = [
     "check_writable",
@@ -234,6 +235,11 @@ def _read(path: StrPath) -> Content:
             if suffix in _READERS:
                 raise InputError("is packed twice: unpack it with gunzip first")
             content = _DECODERS[suffix](_unpacked(data) if packed else data)
+    if isinstance(content, list):
+        for place, (_, pose) in enumerate(content, start=1):
+            fault = "" if pose is None else rigid_fault(pose)
+            if fault:
+                raise InputError(f"{path}: the pose of scan {place} is not a rigid transform: {fault}")
     if number is None:
         return content
     if not isinstance(content, list) or not 1 <= number <= len(content):
