@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from idam.search.confidence import Evidence
 
 import idam
 from idam import RegistrationResult

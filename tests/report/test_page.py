@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud

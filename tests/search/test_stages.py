@@ -57,15 +57,6 @@ def not_asked(guess: np.ndarray) -> np.ndarray:
     pytest.fail("the network was asked")
 
 
-class Speechless:
-    """Features of which all are alike."""
-
-    key = "speechless"
-
-    def describe(self, around: Surroundings) -> np.ndarray:
-        return np.zeros((len(around.points), 4), np.float32)
-
-
 @pytest.fixture(scope="module")
 def easy() -> Pyramid:
     """One sampling twice, with a little noise."""
