@@ -437,6 +437,13 @@ def test_not_sure_of_what_turns_freely_or_has_nothing_in_common(source: np.ndarr
     assert found.reason
 
 
+@pytest.mark.parametrize("refine", ["gicp", None])
+def test_not_sure_of_the_only_answer_in_reach_where_it_is_wrong(refine: Any) -> None:
+    found = idam.register(SOURCE, TARGET, init=motion([0.0, 0.0, 0.0], [9.0, 0.0, 0.0]), max_angle=5, refine=refine)
+    assert degrees(found.transformation, TRUTH) > 50
+    assert found.confidence < CONVERGED
+
+
 @pytest.fixture(scope="module")
 def corridors() -> RegistrationResult:
     """Two scans without noise, three units apart in a corridor that has nothing to tell one place from another."""

@@ -152,6 +152,15 @@ def test_the_lead_of_the_only_answer_is_the_most_that_one_has() -> None:
     assert evidence([answer(CLEAR), answer(replace(NOTHING, off=1.0, border=1e-9))]).lead == LEAD
 
 
+def test_an_only_answer_is_ahead_of_one_that_lays_nothing_on_anything() -> None:
+    nothing = Answer(rigid([0, 0, 0], [9, 0, 0]))
+    assert evidence([nothing]).lead == 0.0
+    little = replace(nothing, likelihood=0.01, overlap=0.05)
+    assert evidence([little]).lead == pytest.approx(weight(little) - weight(nothing))
+    for answers in ([nothing], [little], [little, answer(NOTHING)], [answer(NOTHING)]):
+        assert confidence(evidence(answers)) < 0.5
+
+
 # --- the confidence ------------------------------------------------------------------------------------------------
 
 
