@@ -25,6 +25,7 @@ from idam.search.judge import CONVERGED, LEAD, confidence
 from idam.search.matching import FOR
 from motions import any_rotation, degrees, move
 from motions import rigid as motion
+from rooms import corridor
 from solids import ball, box, bracket, distances, noise, torus
 
 UTM = np.array([5e5, 5.6e6, 100.0])
@@ -434,6 +435,57 @@ def test_not_sure_of_what_turns_freely_or_has_nothing_in_common(source: np.ndarr
     assert found.confidence < CONVERGED
     assert not found.converged
     assert found.reason
+
+
+@pytest.mark.parametrize("refine", ["gicp", None])
+def test_not_sure_of_the_only_answer_in_reach_where_it_is_wrong(refine: Any) -> None:
+    found = idam.register(SOURCE, TARGET, init=motion([0.0, 0.0, 0.0], [9.0, 0.0, 0.0]), max_angle=5, refine=refine)
+    assert degrees(found.transformation, TRUTH) > 50
+    assert found.confidence < CONVERGED
+
+
+@pytest.fixture(scope="module")
+def corridors() -> RegistrationResult:
+    """Two scans without noise, three units apart in a corridor that has nothing to tell one place from another."""
+    return idam.register(corridor(0.0, 3000, seed=1), corridor(3.0, 3000, seed=2))
+
+
+def test_not_sure_where_the_scans_slide(corridors: RegistrationResult) -> None:
+    assert corridors.confidence < CONVERGED
+    assert corridors.reason
+    # by what it says, no axis but the corridor's is free
+    fixed, along = corridors.strength.fixed, corridors.strength.motions[0]
+    assert fixed[0] < 0.03 < fixed[1]
+    assert np.abs(along[3:] / np.linalg.norm(along[3:])).argmax() == 0
+
+
+def test_where_the_scans_slide_runners_up_are_other_places(corridors: RegistrationResult) -> None:
+    assert corridors.hypotheses
+    apart = [
+        (degrees(other.transformation, corridors.transformation), abs(slid(other.transformation, corridors)))
+        for other in corridors.hypotheses
+    ]
+    assert max(angle for angle, _ in apart) > 175  # the other way round
+    for angle, shift in apart:
+        assert angle > 5 or shift > 0.5
+
+
+def slid(transformation: np.ndarray, result: RegistrationResult) -> float:
+    """How far along x a transform puts the source's centroid from where the answer does."""
+    centroid = result.clouds[0].mean(0)
+    return float((move(transformation, centroid) - result.apply(centroid))[0])
+
+
+@pytest.mark.parametrize("name", ["dense", "nothing in common"])
+def test_one_pose_is_not_called_two(name: str) -> None:
+    source, target = PAIRS[name]
+    found = idam.register(source, target)
+    size = Prepared.of(source, "source").radius
+    poses = [found.transformation, *(other.transformation for other in found.hypotheses)]
+    for n, one in enumerate(poses):
+        for other in poses[:n]:
+            shift = np.linalg.norm(move(one, source.mean(0)) - move(other, source.mean(0)))
+            assert degrees(one, other) > 5 or shift > 0.04 * size
 
 
 # --- awkward clouds ------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ class Counted:
 
     def __init__(self, key: str = "counted") -> None:
         self.key = key
-        self.sizes: list[float] = []
+        self.spacings: list[float] = []
 
     def describe(self, around: Surroundings) -> np.ndarray:
         self.spacings.append(spacing_by_definition(around.points))
@@ -68,9 +68,9 @@ def test_levels_are_made_once(cloud: Prepared) -> None:
         level.described(descriptor, level.spacing_rung)
     assert descriptor.spacings == [pytest.approx(level.spacing / ladder(level.spacing_rung), rel=1e-5)]
     level.described(descriptor, level.spacing_rung + 1)
-    assert len(descriptor.sizes) == 2
+    assert len(descriptor.spacings) == 2
     level.described(other, level.spacing_rung)
-    assert len(other.sizes) == 1
+    assert len(other.spacings) == 1
 
 
 def test_same_bits_in_whatever_order_levels_are_asked_for() -> None:

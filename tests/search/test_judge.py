@@ -152,6 +152,15 @@ def test_the_lead_of_the_only_answer_is_the_most_that_one_has() -> None:
     assert evidence([answer(CLEAR), answer(replace(NOTHING, off=1.0, border=1e-9))]).lead == LEAD
 
 
+def test_an_only_answer_is_ahead_of_one_that_lays_nothing_on_anything() -> None:
+    nothing = Answer(rigid([0, 0, 0], [9, 0, 0]))
+    assert evidence([nothing]).lead == 0.0
+    little = replace(nothing, likelihood=0.01, overlap=0.05)
+    assert evidence([little]).lead == pytest.approx(weight(little) - weight(nothing))
+    for answers in ([nothing], [little], [little, answer(NOTHING)], [answer(NOTHING)]):
+        assert confidence(evidence(answers)) < 0.5
+
+
 # --- the confidence ------------------------------------------------------------------------------------------------
 
 
@@ -160,16 +169,19 @@ def test_confidence_is_a_probability() -> None:
         assert 0.0 < confidence(known) < 1.0
 
 
-def test_confidence_grows_with_the_weight_and_does_not_fall_with_the_lead() -> None:
-    given = [replace(known, lead=1.0) for known in any_evidence(50)]
-    by_weight = sorted(given, key=weight)
-    # far from even, the logit is cut off
-    sure = [confidence(known) for known in by_weight]
-    assert sure == sorted(sure)
-    assert sure[0] < sure[-1]
-    for known in given:
+def test_confidence_grows_with_the_lead() -> None:
+    for known in (*any_evidence(50), *GIVEN):
         by_lead = [confidence(replace(known, lead=lead)) for lead in (-LEAD, -1.0, 0.0, 0.5, 2.0, LEAD)]
-        assert by_lead == sorted(by_lead)
+        assert by_lead == sorted(set(by_lead))
+
+
+def test_confidence_is_a_logit_of_the_features_and_the_lead() -> None:
+    given = any_evidence(60)
+    inputs = np.array([[*features(each), each.lead, 1.0] for each in given])
+    logits = np.array([math.log(confidence(each) / (1 - confidence(each))) for each in given])
+    fitted = np.linalg.lstsq(inputs, logits, rcond=None)[0]
+    np.testing.assert_allclose(inputs @ fitted, logits, atol=1e-6)
+    assert (fitted[:-1] >= -1e-9).all()
 
 
 def test_how_far_behind_it_is_counts_up_to_a_point() -> None:

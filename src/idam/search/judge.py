@@ -89,7 +89,8 @@ def weight(answer: Answer | Evidence) -> float:
 def evidence(answers: list[Answer]) -> Evidence:
     """What speaks for the first of the answers."""
     best, *others = answers
-    lead = weight(best) - max((weight(other) for other in others), default=-math.inf)
+    nothing = Answer(np.eye(4))  # an only answer has to be better than one that lays nothing on anything
+    lead = weight(best) - max(weight(other) for other in (*others, nothing))
     known = {field.name: getattr(best, field.name) for field in fields(Evidence) if field.name != "lead"}
     return Evidence(**known, lead=min(lead, LEAD))
 
