@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from idam import rigid
+from idam.align import align, reaches
 from idam.align.information import information
 from idam.align.patches import Dense, Pairs
 from idam.align.polish import finished, polish
@@ -57,9 +58,10 @@ def scanned(shape, seed: int, count: int, noise: float, share: float = 1.0) -> S
 
 def aligned(surfaces: Surfaces, seed: int) -> tuple[Array, Pairs]:
     start = TRUTH @ rigid.exp(np.random.default_rng(seed).normal(scale=0.003, size=6))
-    sparse = len(surfaces.source.points) <= 1024
-    dense = Dense.of_surface(surfaces.source), Dense.of_surface(surfaces.target)
-    return polish(surfaces, start, None if sparse else lambda: dense)
+    if len(surfaces.source.points) <= 1024:
+        start = align(surfaces, start, reaches("symmetric")[1], "symmetric")
+        return finished(surfaces, lambda: (None, None), start, "symmetric", True)  # type: ignore
+    return polish(surfaces, start, lambda: (Dense.of_surface(surfaces.source), Dense.of_surface(surfaces.target)))
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from idam import cli
+from idam import cli, weights
 from idam.cli.shared import tell
 from idam.lab import training
 from idam.lab.data.modelnet40 import experiment_shapes
@@ -28,7 +28,6 @@ from idam.lab.training import Recipe, loop, task
 from idam.lab.training.batches import batch_at, split_validation
 from idam.lab.training.checkpoint import initial_model
 from idam.lab.training.step import SupervisedStep
-from idam.network import pretrained
 from idam.network.pretrained import load_model
 from idam.weights import list_models, provenance
 
@@ -456,8 +455,8 @@ def test_models_shows_every_model_and_where_it_comes_from_at_any_width(columns, 
 def test_models_shows_how_well_features_match_where_that_is_what_was_validated(idam, monkeypatch):
     scores = {"matching": 2.34567, "accuracy": 0.41234}
     told = {"config": {"features": "invariant", "iterations": 1}, "experiment": "general", "validation": scores}
-    monkeypatch.setattr(pretrained, "list_models", lambda: ["mine"])
-    monkeypatch.setattr(pretrained, "provenance", lambda _: told)
+    monkeypatch.setattr(weights, "list_models", lambda: ["mine"])
+    monkeypatch.setattr(weights, "provenance", lambda _: told)
     outcome = idam("models")
     assert outcome.code == 0
     assert "accuracy 0.412, matching loss 2.346" in outcome.out

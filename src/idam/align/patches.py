@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from idam import rigid
-from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surfaces
+from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surface, Surfaces
 from idam.rigid import Array
 
 __all__ = ["Dense", "Pairs", "Patches", "patch_size"]
@@ -48,6 +48,11 @@ class Dense:
         import small_gicp
 
         return cls(points, small_gicp.KdTree(points))
+
+    @classmethod
+    def of_surface(cls, surface: Surface) -> Dense:
+        """All points of a surface, whose tree is there."""
+        return cls(surface.points, surface.tree)
 
     def patches(self, places: Array, size: int) -> tuple[Patches, Array, Array]:
         """The means of the ``size`` points nearest to each of the places (C, 3), with normals of more where few.
@@ -132,9 +137,13 @@ class Pairs:
         return float(growth.mean() / self.weights.mean())
 
     @cached_property
+    def scale(self) -> float:
+        """The robust standard deviation of the residuals."""
+        return 1.4826 * float(np.median(np.abs(self.residuals)))
+
+    @cached_property
     def _relative(self) -> Array:
-        scale = 1.4826 * float(np.median(np.abs(self.residuals)))
-        return np.asarray((self.residuals / (STRAY * max(scale, 1e-12))) ** 2)
+        return np.asarray((self.residuals / (STRAY * max(self.scale, 1e-12))) ** 2)
 
     def each_way(self) -> Pairs:
         """The same pairs held along all three axes, as copies of points hold each other."""

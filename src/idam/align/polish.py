@@ -20,6 +20,9 @@ STILL = 5e-6
 """Length of a step, in radians and working units, from which on it is done."""
 FEWEST = 30
 """Pairs of patches below which the start stays."""
+EXACT = 0.1
+"""Robust standard deviation of sparse clouds' residuals, in spacings, below which their points alone are more exact
+than the symmetric method: with noise of 1 % of the spacing ten times as exact, with 20 % of it less."""
 FARTHEST = 3.0
 """Spacings by which it may move the source's points (root mean square): more is not polishing, and the start stays."""
 
@@ -38,7 +41,11 @@ def finished(
     """
     if method == "symmetric" and copies(surfaces, start):
         return start, Pairs.of_points(surfaces, start).each_way()
-    if not last:
+    if method == "symmetric" and last:
+        polished = _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
+        if polished[1].scale < EXACT * surfaces.spacing:
+            return polished
+    if method == "symmetric" or not last:
         return start, Pairs.of_points(surfaces, start)
     return polish(surfaces, start, dense)
 
