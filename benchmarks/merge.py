@@ -7,7 +7,7 @@
 ``objects``: folders of scans with a ``pairs.json``, whose pairs compose to the true poses. Each scan is turned at
 random first. Open3D gets the pairs by FPFH, RANSAC and point-to-plane ICP with its voxel size set by hand, and idam's
 own links too; its graph starts from the spanning tree of the best fitness, every edge is uncertain (its line process),
-and its settings are those of its tutorial. ``rooms``: scans by a made-up scanner on its way through made-up rooms.
+and its settings are those of its tutorial. ``rooms``: scans by a simulated scanner on its way through simulated rooms.
 ``growth``: the same with fewer points, by the number of scans.
 """
 

@@ -1,4 +1,4 @@
-"""Real scans: how many pairs ``idam.register`` lays right with nothing set, next to rivals with their voxel size set.
+"""Real scans: how many pairs ``idam.register`` gets right with no option set, next to rivals with a voxel size set.
 
     python benchmarks/scans.py FOLDER... [--voxel-size NAME=SIZE ...] [--json FILE]
 

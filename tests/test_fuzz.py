@@ -67,6 +67,17 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="n
 pytestmark = needs_proc
 
 
+TRIED: list[int] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def count() -> Iterator[None]:
+    """Leaves the number of inputs for benchmarks/fuzz.py."""
+    yield
+    if "IDAM_FUZZ_COUNT" in os.environ:
+        Path(os.environ["IDAM_FUZZ_COUNT"]).write_text(str(len(TRIED)))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
@@ -76,6 +87,7 @@ def read_or_refuse(
     path: Path, content: bytes, read: Callable[[Path], Any] = read_point_cloud, output: Path | None = None
 ) -> Any:
     """What is read, or None where it is refused as it should be."""
+    TRIED.append(len(content))
     path.write_bytes(content)
     started = time.process_time()
     try:
@@ -440,6 +452,7 @@ def test_transforms_that_overflow_are_refused(folder: Path, huge: str) -> None:
 
 def checked(data: Any) -> np.ndarray | None:
     """What registration makes of it, or None where it is refused as it should be."""
+    TRIED.append(0)
     try:
         with little_memory(), np.errstate(over="ignore"):
             points = as_point_cloud(data).points

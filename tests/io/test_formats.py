@@ -473,7 +473,18 @@ def test_ptx_poses_and_points_not_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["", "1\n", "a\nb\n", PTX[:-20], PTX.replace("1 0 0 0.5 255 0 9", "0 0 0 0 0 0 0"), PTX + "2\n"]
+    "content",
+    [
+        "",
+        "1\n",
+        "a\nb\n",
+        PTX[:-20],
+        PTX.replace("1 0 0 0.5 255 0 9", "0 0 0 0 0 0 0"),
+        PTX + "2\n",
+        PTX.replace("-1 0 0 0", "-2 0 0 0"),
+        PTX.replace("-1 0 0 0", "1 0 0 0"),
+        PTX.replace("10 20", "1e400 20"),
+    ],
 )
 def test_ptx_faults(tmp_path: Path, content: str) -> None:
     with pytest.raises(InputError):

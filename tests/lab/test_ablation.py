@@ -9,7 +9,8 @@ import pytest
 from idam.lab.evaluation.methods import ABLATION, build_method
 from idam.lab.evaluation.methods.network import find_ablation_weights
 from idam.lab.training import loop
-from idam.network.pretrained import load_model, provenance
+from idam.network.pretrained import load_model
+from idam.weights import provenance
 
 
 @pytest.fixture

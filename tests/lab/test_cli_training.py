@@ -29,7 +29,8 @@ from idam.lab.training.batches import batch_at, split_validation
 from idam.lab.training.checkpoint import initial_model
 from idam.lab.training.step import SupervisedStep
 from idam.network import pretrained
-from idam.network.pretrained import list_models, load_model, provenance
+from idam.network.pretrained import load_model
+from idam.weights import list_models, provenance
 
 
 class Outcome(NamedTuple):

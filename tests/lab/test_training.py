@@ -32,8 +32,9 @@ from idam.lab.training.task import validate
 from idam.network.config import Config
 from idam.network.geometry import apply_transform, euler_xyz_to_rotation, rotation_angle
 from idam.network.model import IDAM
-from idam.network.pretrained import load_model, provenance, save_model
+from idam.network.pretrained import load_model, save_model
 from idam.network.supervision import Loss
+from idam.weights import provenance
 from watching import watched_log
 
 SMALL = Recipe(

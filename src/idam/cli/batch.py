@@ -34,7 +34,7 @@ def batch(
     within: Annotated[Path | None, typer.Option(help="Pair the scans in this folder with one another.")] = None,
     partners: Annotated[
         int | None,
-        typer.Option(min=1, help="For each scan so many, the likeliest; for up to 30 scans all if left out."),
+        typer.Option(min=1, help="Likeliest partners of each scan; if left out, all for up to 30 scans, else 8."),
     ] = None,
     collect: Annotated[
         Path | None, typer.Option(help="Write the rows of this run as one table: .csv, .jsonl or .parquet.")

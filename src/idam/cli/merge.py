@@ -32,17 +32,17 @@ def merge(
         int | None, typer.Option(help="Likely partners to register each scan with; all of up to 30 if left out.")
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes; one a core if left out.")] = None,
-    threshold: Annotated[float, typer.Option(help="Probability from which a place counts as sure.")] = 0.9,
+    threshold: Annotated[float, typer.Option(help="Confidence from which a pose counts as certain.")] = 0.9,
     poses: Annotated[Path | None, typer.Option(help="File of starting poses, as poses.json.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Stop at a scan that cannot be read.")] = False,
     no_cloud: Annotated[bool, typer.Option("--no-cloud", help="Do not write the merged cloud.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
-    """Put many scans together: find their poses, and say which have no sure place.
+    """Register many scans into one model, and report those without a certain pose.
 
     Writes poses.json, poses.tum, poses.kitti, graph.g2o, transforms/, merged.ply and report.html. A run that was
-    stopped goes on from the pairs it has. The exit code is 0 where every scan is placed, 1 where one is not or hangs on
-    one link, and 2 for bad input.
+    stopped continues with the pairs it has. The exit code is 0 if every scan has a certain pose, 1 if one has not or is
+    held by a single link, and 2 for bad input.
 
     [bold]Examples[/bold]
 

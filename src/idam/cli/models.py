@@ -7,7 +7,7 @@ __all__ = ["models"]
 USES = {
     "general": "scans of any kind, in any pose: what 'idam register' uses unless told otherwise",
     "practice-any-rotation": "sparse, noisy clouds of single objects, in any pose",
-    "gnn-practice": "the same with rotations of up to 90 degrees (--max-angle 90), after practice-any-rotation+",
+    "gnn-practice": "sparse, noisy clouds of single objects that stand upright, with --max-angle 90",
     "gnn-gaussian-noise": "the paper's experiment; symmetric objects that stand upright, with --max-angle 90",
 }
 """What to choose a model for; all others are for the paper's experiments."""

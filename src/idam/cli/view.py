@@ -12,9 +12,9 @@ __all__ = ["view"]
 
 def view(
     source: Annotated[Path, typer.Argument(help="The cloud to move.")],
-    target: Annotated[Path, typer.Argument(help="The cloud to look at it with.")],
+    target: Annotated[Path, typer.Argument(help="The cloud that stays.")],
     transform: Annotated[
-        Path | None, typer.Argument(help="File of the transform to move it by; none if left out.")
+        Path | None, typer.Argument(help="File of the transform; if left out, the clouds as they are.")
     ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Write the page here.")] = Path("view.html"),
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the page.")] = False,

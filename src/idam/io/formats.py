@@ -30,6 +30,7 @@ from idam.io.files import (
     read_bytes,
     write_bytes,
 )
+from idam.io.transforms import rigid_fault
 
 __all__ = [
     "check_writable",
@@ -192,7 +193,9 @@ def move_file(source: StrPath, transformation: ArrayLike, output: StrPath) -> No
             _write_scans(output, [Scan(scan.name, scan.cloud, matrix @ _pose(scan)) for scan in scans])
             return
         content = joined([scan.placed() for scan in scans])
-    _write(output, content.transformed(matrix))
+    with np.errstate(all="ignore"):  # of damaged normals
+        moved_content = content.transformed(matrix)
+    _write(output, moved_content)
 
 
 def check_writable(path: StrPath) -> None:
@@ -232,6 +235,11 @@ def _read(path: StrPath) -> Content:
             if suffix in _READERS:
                 raise InputError("is packed twice: unpack it with gunzip first")
             content = _DECODERS[suffix](_unpacked(data) if packed else data)
+    if isinstance(content, list):
+        for place, (_, pose) in enumerate(content, start=1):
+            fault = "" if pose is None else rigid_fault(pose)
+            if fault:
+                raise InputError(f"{path}: the pose of scan {place} is not a rigid transform: {fault}")
     if number is None:
         return content
     if not isinstance(content, list) or not 1 <= number <= len(content):

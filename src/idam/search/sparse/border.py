@@ -1,9 +1,9 @@
 """What one scan shows and the other does not lies past where the other ends.
 
-A transform that slides a surface along itself, or turns a symmetric thing over, lays much on each other, but leaves
-points of one cloud alone amid those of the other: the other scan ought to have seen them. Where scans end, they end at
-a border, and a plane is the simplest one: a half-space crops the clouds of the paper's protocol, and what a scanner
-sees of a thing ends not much otherwise.
+A transform that slides a surface along itself, or turns a symmetric object over, brings much of both together, but
+leaves points of one cloud alone amid those of the other: the other scan ought to have seen them. Where scans end, they
+end at a border, and a plane is the simplest one: a half-space crops the clouds of the paper's protocol, and what a
+scanner sees of an object ends much the same way.
 """
 
 from __future__ import annotations
