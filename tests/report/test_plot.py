@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -153,3 +155,9 @@ def test_what_cannot_be_written_leaves_nothing(
     with pytest.raises(InputError, match="no folder"):
         write_plot(path, PointCloud(source), PointCloud(target), result, source_name="a", target_name="b")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_need_no_torch_and_no_scipy() -> None:
+    code = "import sys, idam.report.plot; print(*sorted({'torch', 'scipy', 'idam.lab'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == "\n"

@@ -15,8 +15,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
-from torch import Tensor
+from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["Array", "dot", "draw_clouds", "empty_grid", "head", "legend", "project", "same_scale"]
 
@@ -29,7 +28,7 @@ LETTER = 0.062
 Array = NDArray[np.float64]
 
 
-def project(points: Tensor | Array, up: int) -> Array:
+def project(points: ArrayLike, up: int) -> Array:
     """Points (N, 3) as seen obliquely from above: how far to the right, up, and towards the viewer."""
     sin_a, cos_a, sin_e, cos_e = math.sin(AZIMUTH), math.cos(AZIMUTH), math.sin(ELEVATION), math.cos(ELEVATION)
     axes = np.array(
