@@ -225,7 +225,7 @@ def rooms(count: int, points: int, seed: int = 0) -> tuple[list[Array], Array]:
     return scans, np.stack(poses)
 
 
-def box_surface(low: Array, high: Array, random: np.random.Generator, density: float = 1500.0) -> Array:
+def box_surface(low: Array, high: Array, random: np.random.Generator, density: float = 400.0) -> Array:
     """Random points on the faces of a box, so many to the square metre."""
     size = high - low
     faces = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graphs import SPREAD, errors, information, links_of, made
 
 from idam import rigid
 from idam.many.elimination import Elimination
@@ -25,6 +24,7 @@ from idam.many.graph import (
 )
 from idam.many.loops import find_loops
 from idam.rigid import Array
+from many.graphs import SPREAD, errors, information, links_of, made
 
 RANDOM = np.random.default_rng(0)
 

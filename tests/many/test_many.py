@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worlds import Registers, World, world
 
 import idam
 from idam import rigid
 from idam.errors import InputError
 from idam.io import PointCloud, write_point_cloud
 from idam.many.merge import merge
+from many.worlds import Registers, World, world
 
 
 @pytest.fixture

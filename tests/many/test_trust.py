@@ -6,13 +6,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from graphs import SPREAD, Made, errors, links_of, made
 
 from idam import rigid
 from idam.many.graph import optimise
 from idam.many.loops import find_loops
 from idam.many.trust import ALIKE, Trust, weigh
 from idam.rigid import Array
+from many.graphs import SPREAD, Made, errors, links_of, made
 
 RANDOM = np.random.default_rng(0)
 

@@ -1,0 +1,128 @@
+"""Partners, kept pairs, the merged cloud, and the coordinates between."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from idam import rigid
+from idam.errors import InputError
+from idam.io import PointCloud
+from idam.many.cloud import fuse
+from idam.many.frame import Frame
+from idam.many.pairs import Kept
+from idam.many.partners import all_pairs, likeliest, likeliness, vote
+from idam.many.scans import described, read_scans
+from many.worlds import world
+
+RANDOM = np.random.default_rng(0)
+
+
+def test_all_pairs_are_all_pairs() -> None:
+    assert all_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+
+
+def test_likeliest_partners_are_those_not_tried_yet() -> None:
+    scores = np.array([[0, 3, 2, 1], [3, 0, 0, 0], [2, 0, 0, 5], [1, 0, 5, 0]], float)
+    assert likeliest(scores, 1, range(4), set()) == [(0, 1), (2, 3)]
+    assert likeliest(scores, 1, [0], {(0, 1)}) == [(0, 2)]
+    assert likeliest(scores, 9, [0], {(0, 1), (0, 2), (0, 3)}) == []
+
+
+def test_a_vote_for_the_same_place_beats_one_for_another() -> None:
+    points, features = RANDOM.normal(size=(100, 3)), RANDOM.normal(size=(100, 16))
+    turned = rigid.apply(rigid.exp(RANDOM.normal(size=6)), points)
+    same = vote(points, features, turned, features + 0.3 * RANDOM.normal(size=(100, 16)), 0.05)
+    other = vote(points, features, RANDOM.normal(size=(100, 3)), RANDOM.normal(size=(100, 16)), 0.05)
+    assert same > 20 * max(other, 1)
+
+
+def test_a_vote_changes_with_no_pose() -> None:
+    points, features = RANDOM.normal(size=(50, 3)), RANDOM.normal(size=(50, 8))
+    other, theirs = RANDOM.normal(size=(50, 3)), features + RANDOM.normal(size=(50, 8))
+    turned = rigid.apply(rigid.exp(RANDOM.normal(size=6)), other)
+    assert vote(points, features, other, theirs, 0.5) == vote(points, features, turned, theirs, 0.5)
+
+
+def test_scans_of_one_object_are_likelier_partners_than_of_two() -> None:
+    one, other = world(3, seed=3, points=3000), world(3, seed=4, points=3000)
+    _, scans = read_scans([*one.scans, *other.scans])
+    scores = likeliness(*described([scan for scan in scans if not isinstance(scan, str)]))
+    np.testing.assert_array_equal(scores, scores.T)
+    for scan in range(6):
+        best = int(np.argsort(-scores[scan])[0])
+        assert best // 3 == scan // 3
+
+
+def test_kept_rows_come_back_and_a_torn_line_does_not(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.jsonl"
+    kept = Kept(path)
+    for key in "abc":
+        kept.add(key, {"value": key})
+    path.write_text(path.read_text()[:-5])
+    again = Kept(path)
+    assert set(again.rows) == {"a", "b"}
+    again.add("d", {"value": "d"})
+    assert set(Kept(path).rows) == {"a", "b", "d"}
+    path.write_text(path.read_text() + "no json\n[1]\n{}\n")
+    assert set(Kept(path).rows) == {"a", "b", "d"}
+
+
+def test_kept_rows_are_in_the_file_as_soon_as_they_are_added(tmp_path: Path) -> None:
+    kept = Kept(tmp_path / "pairs.jsonl")
+    kept.add("a", {"value": 1.5})
+    assert json.loads((tmp_path / "pairs.jsonl").read_text()) == {"key": "a", "value": 1.5}
+    with pytest.raises(InputError, match="cannot be written"):
+        Kept(tmp_path / "none" / "pairs.jsonl").add("a", {})
+    with pytest.raises(InputError, match="cannot be read"):
+        Kept(tmp_path)
+
+
+def test_fused_points_are_the_means_of_their_voxels() -> None:
+    points = RANDOM.uniform(0, 3, (500, 3))
+    points[0] = 0  # where the grid begins
+    colors = RANDOM.integers(0, 256, (500, 3), dtype=np.uint8)
+    normals = RANDOM.normal(size=(500, 3))
+    halves = [PointCloud(points[rows], colors[rows], normals[rows]) for rows in (slice(0, 200), slice(200, 500))]
+    fused = fuse(halves, 1.0, [4, 7])
+    cells = np.floor(points).astype(int)
+    expected = sorted(map(tuple, np.unique(cells, axis=0)))
+    assert len(fused.points) == len(expected)
+    for place, cell in enumerate(expected):
+        inside = (cells == cell).all(1)
+        np.testing.assert_allclose(fused.points[place], points[inside].mean(0))
+        np.testing.assert_allclose(fused.colors[place], colors[inside].mean(0), atol=0.5 + 1e-9)
+        mean = normals[inside].mean(0)
+        np.testing.assert_allclose(fused.normals[place], mean / np.linalg.norm(mean))
+        assert fused.attributes["scan"][place] == (4 if inside[:200].any() else 7)
+
+
+def test_what_cannot_be_fused_is_refused() -> None:
+    with pytest.raises(InputError, match="no scan has a pose"):
+        fuse([], 1.0, [])
+    with pytest.raises(InputError, match="too small"):
+        fuse([PointCloud(RANDOM.normal(size=(10, 3)))], 1e-12, [0])
+
+
+def test_the_frame_leaves_as_it_enters() -> None:
+    frame = Frame(RANDOM.normal(size=(3, 3)) * 1000, 7.0)
+    true = rigid.exp(RANDOM.normal(size=(3, 6)))
+    working = np.stack([np.eye(4), *(frame.enter(scan, 0, rigid.inverse(true[0]) @ true[scan]) for scan in (1, 2))])
+    final = frame.leave(working, [[0, 1, 2]])
+    np.testing.assert_allclose(final, rigid.inverse(true[0]) @ true, atol=1e-9)
+
+
+def test_the_covariance_in_the_frame_is_that_of_the_transform() -> None:
+    """By its own meaning: draw transforms with that information, and see how they scatter once they have entered."""
+    frame = Frame(np.array([[3.0, -2.0, 1.0], [0.5, 0.0, 2.0]]), 5.0)
+    root = 1e-3 * RANDOM.normal(size=(6, 6))
+    covariance = root @ root.T
+    true = rigid.exp(RANDOM.normal(size=6))
+    drawn = true @ rigid.exp(RANDOM.multivariate_normal(np.zeros(6), covariance, 4000))
+    entered = np.stack([frame.enter(0, 1, each) for each in drawn])
+    scatter = np.cov(rigid.log(rigid.inverse(frame.enter(0, 1, true)) @ entered).T)
+    expected = frame.covariance(0, np.linalg.inv(covariance))
+    np.testing.assert_allclose(scatter, expected, atol=0.08 * np.abs(expected).max())
