@@ -9,7 +9,7 @@ PIP := -m pip --disable-pip-version-check --no-input
 CORE := .venv-core
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core lint setup clean
+.PHONY: help demo test test-core lint fuzz setup clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
@@ -28,6 +28,9 @@ lint: $(VENV)/.installed-dev ## check style and types
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+
+fuzz: $(VENV)/.installed-dev ## try fresh damaged input for MINUTES (10), keep what fails
+	$(BIN)/python benchmarks/fuzz.py --minutes $(or $(MINUTES),10)
 
 setup: $(VENV)/.installed-dev ## only set up .venv for development
 

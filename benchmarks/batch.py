@@ -65,8 +65,8 @@ def finish(pairs: Path, run: Path, *options: str) -> tuple[float, float]:
     process = start(pairs, run, *options)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):
-        raise SystemExit(process.returncode)
+    if process.returncode not in (0, 1) or not lines_of(run):
+        raise SystemExit(f"{shlex.join(options)}: failed with exit code {process.returncode}")
     return time.perf_counter() - started, usage.ru_utime + usage.ru_stime
 
 

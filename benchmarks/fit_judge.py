@@ -171,27 +171,27 @@ def fit(records: list[dict[str, Any]]) -> dict[str, Any]:
 
     def unlikely(w: Array) -> float:
         logit = design @ w
-        return float((np.logaddexp(0, logit) - right * logit).sum() + 0.01 * (w[1:] ** 2).sum())
+        return float((np.logaddexp(0, logit) - right * logit).sum() + 0.3 * (w[1:] ** 2).sum())
 
-    bias, scale, lead = minimize(
-        unlikely, np.zeros(3), method="L-BFGS-B", bounds=[(None, None), (0, None), (0, None)]
-    ).x
+    bounds: list[tuple[float | None, None]] = [(None, None)] + [(0.0, None)] * (len(FEATURES) + 1)
+    bias, *known, lead = minimize(unlikely, np.zeros(len(bounds)), method="L-BFGS-B", bounds=bounds).x
     return {
         "weights": {name: round(float(w), 4) for name, w in zip(FEATURES, weights, strict=True)},
         "bias": round(float(bias), 4),
-        "scale": round(float(scale), 4),
+        "confidence": {name: round(float(w), 4) for name, w in zip(FEATURES, known, strict=True)},
         "lead": round(float(lead), 4),
     }
 
 
 def summaries(records: list[dict[str, Any]], weights: Array) -> tuple[Array, Array]:
-    """Weight and lead of each pair's best answer (N, 2), and whether it is right (N,)."""
+    """Features and lead of each pair's best answer (N, 9), and whether it is right (N,)."""
     said, right = [], []
     for record in records:
-        z = np.array(record["features"]) @ weights
+        known = np.array(record["features"])
+        z = known @ weights
         best = int(z.argmax())
         others = np.delete(z, best)
-        said.append((z[best], min(z[best] - others.max(), LEAD) if len(others) else LEAD))
+        said.append([*known[best], min(z[best] - others.max(), LEAD) if len(others) else LEAD])
         right.append(record["right"][best])
     return np.array(said), np.array(right, float)
 
@@ -199,7 +199,8 @@ def summaries(records: list[dict[str, Any]], weights: Array) -> tuple[Array, Arr
 def confidences(records: list[dict[str, Any]], held: dict[str, Any]) -> tuple[Array, Array]:
     """What a fit says of pairs (N,), and whether it is right (N,)."""
     said, right = summaries(records, np.array([held["weights"][name] for name in FEATURES]))
-    return 1 / (1 + np.exp(-(held["bias"] + said @ [held["scale"], held["lead"]]))), right
+    weights = [*(held["confidence"][name] for name in FEATURES), held["lead"]]
+    return 1 / (1 + np.exp(-(held["bias"] + said @ weights))), right
 
 
 def figures(said: Array, right: Array, records: list[dict[str, Any]]) -> dict[str, float]:

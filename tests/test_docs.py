@@ -6,8 +6,9 @@ import re
 import shlex
 import shutil
 from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import typer
@@ -16,39 +17,51 @@ from idam import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ["README.md", "docs/guide.md", "docs/examples.md"]
+"""Those whose Python runs here."""
 
 
 @pytest.fixture
 def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, with the shipped scans in it under the names that the pages use."""
-    with resources.as_file(resources.files("idam") / "data" / "demo") as demo:
+    with resources.as_file(resources.files("idam.demo")) as demo:
         for name, role in (("scan1.ply", "source.ply"), ("scan2.ply", "target.ply")):
             shutil.copy(demo / role, tmp_path / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def blocks(page: str, *languages: str) -> list[tuple[int, str]]:
-    """The fenced blocks of a page in these languages: the number of their first line, and their text."""
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    line: int
+    """Number of its first line."""
+    needs: str
+    """The package that it needs besides the core, or nothing: ``<!-- needs NAME -->`` stands in the line before."""
+    text: str
+
+
+def blocks(page: str, *languages: str) -> list[Block]:
     text = (ROOT / page).read_text(encoding="utf-8")
-    fenced = re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    return [(text.count("\n", 0, each.start(2)) + 1, each[2]) for each in fenced if each[1] in languages]
+    fenced = re.finditer(r"^(?:<!-- needs (\w+) -->\n)?```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [
+        Block(text.count("\n", 0, each.start(3)) + 1, each[1] or "", each[3]) for each in fenced if each[2] in languages
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_python_blocks_run_one_after_the_other(scans: Path, page: str) -> None:
-    if "figures" in (ROOT / page).read_text(encoding="utf-8"):
-        pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
     namespace: dict[str, Any] = {"__name__": "__main__"}
     found = blocks(page, "python")
     assert found
-    for line, block in found:
+    for line, needs, block in found:
+        if needs and find_spec(needs) is None:
+            continue
         # the line breaks before it make the line numbers of a traceback the page's own
         exec(compile("\n" * (line - 1) + block, str(ROOT / page), "exec"), namespace)
 
 
 def command_lines() -> list[list[str]]:
-    lines = [line for page in PAGES for _, block in blocks(page, "", "sh") for line in block.splitlines()]
+    lines = [line for page in PAGES for block in blocks(page, "", "sh") for line in block.text.splitlines()]
     commands = [re.search(r"\bidam [a-z].*", line.partition("#")[0]) for line in lines]
     return [re.split(r"[>;|&]", found[0])[0].split() for found in commands if found]
 

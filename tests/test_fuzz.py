@@ -1,8 +1,14 @@
-"""Damaged, absurd and hostile input: read or refused in one line, quickly, in little memory. The same every time."""
+"""Damaged, absurd and hostile input: read or refused in one line, quickly, in little memory.
+
+The same every time; but where the environment's IDAM_FUZZ says how many examples each test takes, as ``make fuzz``
+does, they are fresh ones, and what fails is kept in .hypothesis and tried first the next time.
+"""
 
 from __future__ import annotations
 
+import gzip
 import io
+import os
 import re
 import struct
 import time
@@ -17,11 +23,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.database import DirectoryBasedExampleDatabase
 from hypothesis.extra import numpy as hnp
 
 from idam.clouds.frame import check_points
 from idam.errors import InputError
-from idam.io import PointCloud, read_point_cloud, read_transform, write_point_cloud
+from idam.io import PointCloud, as_point_cloud, move_file, read_point_cloud, read_transform, write_point_cloud
+from idam.io.notations import FORMS
 
 resource = pytest.importorskip("resource", reason="memory is limited by setrlimit, which this system lacks")
 
@@ -30,10 +38,15 @@ MEMORY = 2**28
 SECONDS = 2.0
 """Processor time it may take."""
 
+FRESH = int(os.environ.get("IDAM_FUZZ", "0"))
 fuzz = settings(
-    max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+    max_examples=FRESH or 60,
+    deadline=None,
+    derandomize=not FRESH,
+    database=DirectoryBasedExampleDatabase(".hypothesis/fuzz") if FRESH else None,
+    suppress_health_check=list(HealthCheck),
 )
-few = settings(fuzz, max_examples=20)
+few = settings(fuzz, max_examples=FRESH or 20)
 
 
 @contextmanager
@@ -48,6 +61,8 @@ def little_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
+MOTION = np.array([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
+
 needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory's size from")
 pytestmark = needs_proc
 
@@ -57,7 +72,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-def read_or_refuse(path: Path, content: bytes, read: Callable[[Path], Any] = read_point_cloud) -> Any:
+def read_or_refuse(
+    path: Path, content: bytes, read: Callable[[Path], Any] = read_point_cloud, output: Path | None = None
+) -> Any:
     """What is read, or None where it is refused as it should be."""
     path.write_bytes(content)
     started = time.process_time()
@@ -67,7 +84,7 @@ def read_or_refuse(path: Path, content: bytes, read: Callable[[Path], Any] = rea
             found = read(path)
     except InputError as error:
         found, message = None, str(error)
-        assert message.startswith(f"{path}: ") and "\n" not in message and len(message) < 500
+        assert message.startswith((f"{path}: ", f"{output}: ")) and "\n" not in message and len(message) < 500
         assert "memory" not in message
     assert not warned
     assert time.process_time() - started < SECONDS
@@ -101,8 +118,20 @@ def real_file(folder: Path, name: str) -> bytes:
     suffix = name.partition(".")[2]
     if suffix in ("las", "laz"):
         return las(suffix)
+    if suffix == "e57":
+        pytest.importorskip("pye57")
+    if suffix == "glb":
+        trimesh = pytest.importorskip("trimesh")
+        return bytes(trimesh.creation.box().export(file_type="glb"))
     by_hand = {
         "a.obj": MESH.encode(),
+        "coff.off": b"CNOFF\n3 0 0\n0 0 0 0 0 1 255 0 9 255\n1 0 0 0 0 1 255 0 9 255\n0 1 0 0 0 1 2 3 4 255\n",
+        "a.ptx": (
+            b"3\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n0 1 0 0\n-1 0 0 0\n0 0 1 0\n10 20 30 1\n" + b"1 0 0 0.5 1 2 3\n" * 3
+        )
+        * 2,
+        "a.bin": np.random.default_rng(0).random((40, 4), np.float32).tobytes(),
+        "a.xyz.gz": gzip.compress(b"0 0 0\n1 0 0\n0 1 0\n" * 40, mtime=0),
         "a.off": b"OFF\n4 2 0\n0 0 0\n3 0 0\n0 1 0\n3 0 3\n3 0 1 2\n3 0 1 3\n",
         "ascii.stl": SOLID.encode(),
         "a.stl": bytes(80) + struct.pack("<I", 1) + struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 3, 0, 0, 0, 1, 0, 0),
@@ -172,7 +201,7 @@ NAMES = [
     "a.obj",
     "a.off",
 ]
-NAMES += ["a.stl", "ascii.stl", "a.las", "a.laz"]
+NAMES += ["a.stl", "ascii.stl", "a.las", "a.laz", "coff.off", "a.ptx", "a.bin", "a.xyz.gz", "a.glb", "a.e57"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -184,6 +213,22 @@ def test_damaged_files(folder: Path, name: str) -> None:
     @given(damaged(valid))
     def check(data: bytes) -> None:
         read_or_refuse(path, data)
+
+    check()
+
+
+@pytest.mark.parametrize(
+    "name", ["a.ply", "ascii.ply", "a.obj", "a.off", "coff.off", "a.stl", "a.las", "a.laz", "a.csv"]
+)
+def test_damaged_files_move_or_are_refused(folder: Path, name: str) -> None:
+    valid, source, moved = real_file(folder, name), folder / f"still-{name}", folder / f"moved-{name}"
+
+    @fuzz
+    @given(damaged(valid))
+    def check(data: bytes) -> None:
+        moved.unlink(missing_ok=True)
+        done = read_or_refuse(source, data, lambda path: [move_file(path, MOTION, moved)], moved)
+        assert (done is not None) == moved.exists()
 
     check()
 
@@ -300,12 +345,14 @@ MADE_UP = {
     "made.obj": meshes(),
     "made.off": meshes(),
     "made.stl": meshes(),
+    "made.xyz": tables(),
+    "made.ptx": tables(),
 }
 
 
 @pytest.mark.parametrize("name", MADE_UP)
 def test_made_up_files(folder: Path, name: str) -> None:
-    @settings(fuzz, max_examples=120)
+    @settings(fuzz, max_examples=FRESH or 120)
     @given(MADE_UP[name])
     def check(content: bytes) -> None:
         read_or_refuse(folder / name, content)
@@ -367,6 +414,21 @@ def test_damaged_transforms(folder: Path, content: bytes, suffix: str) -> None:
         assert found.shape == (4, 4) and np.isfinite(found).all()
 
 
+WORDS = [
+    "1", "0", "-0.5", "1e400", "nan", "90", "translation", "quaternion", "xyzw", "wxyz", "euler", "xyz", "ZYX", "rpy",
+    "degrees", "intrinsic", "extrinsic", "static_transform_publisher", "--x", "--qw", "--yaw", "[", "\n", "tx", "qw",
+]  # fmt: skip
+
+
+@fuzz
+@given(st.lists(st.sampled_from(WORDS), max_size=24), st.sampled_from([*FORMS]))
+def test_made_up_transforms(folder: Path, words: list[str], form: str) -> None:
+    found = read_or_refuse(folder / "made.txt", " ".join(words).encode(), read_transform)
+    if found is not None:
+        (folder / "again.txt").write_text(FORMS[form](found))
+        np.testing.assert_allclose(read_transform(folder / "again.txt"), found, atol=2e-3)
+
+
 @pytest.mark.parametrize("huge", ["1e308 0 0", "1e308 1e308 0", "1e200 -1e200 1e200"])
 def test_transforms_that_overflow_are_refused(folder: Path, huge: str) -> None:
     content = f"{huge} 5\n1e308 -1e308 0 6\n0 0 1 7\n0 0 0 1\n".encode()
@@ -378,13 +440,12 @@ def test_transforms_that_overflow_are_refused(folder: Path, huge: str) -> None:
 
 def checked(data: Any) -> np.ndarray | None:
     """What registration makes of it, or None where it is refused as it should be."""
-    from idam.registration import as_points
-
     try:
         with little_memory(), np.errstate(over="ignore"):
-            points = as_points(data, "source")
+            points = as_point_cloud(data).points
+            check_points(points, "source")
     except InputError as error:
-        assert str(error).startswith("source: ") and "\n" not in str(error)
+        assert "\n" not in str(error) and len(str(error)) < 500
         return None
     assert points.dtype == np.float64
     assert points.ndim == 2 and points.shape[1] == 3 and len(points) >= 20
@@ -396,7 +457,7 @@ DTYPES = hnp.scalar_dtypes() | st.sampled_from([np.dtype("O"), np.dtype([("x", "
 SHAPES = hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4) | st.sampled_from([(25, 3), (3, 25), (25, 4)])
 
 
-@settings(fuzz, max_examples=150)
+@settings(fuzz, max_examples=FRESH or 150)
 @given(st.data())
 def test_any_array(data: st.DataObject) -> None:
     checked(data.draw(hnp.arrays(data.draw(DTYPES), data.draw(SHAPES), fill=st.nothing())))

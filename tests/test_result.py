@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from importlib import metadata, resources
 from pathlib import Path
 
 import numpy as np
 import pytest
-from idam.search.confidence import Evidence
 
 import idam
 from idam import RegistrationResult
@@ -17,6 +16,7 @@ from idam.errors import InputError
 from idam.io import read_transform
 from idam.result import Hypothesis, Matches
 from motions import rigid
+from results import EVIDENCE, STRENGTH, made_up
 from solids import distances
 
 SOURCE = np.random.default_rng(0).normal(size=(50, 3))
@@ -26,21 +26,13 @@ SOURCE = np.random.default_rng(0).normal(size=(50, 3))
 def result() -> RegistrationResult:
     transformation = rigid([0.1, -2.0, 0.7], [5e5, -5.6e6, 1 / 3])
     target = SOURCE @ transformation[:3, :3].T + transformation[:3, 3]
-    return RegistrationResult(
-        transformation=transformation,
-        fitness=0.75,
-        inlier_rmse=0.01,
-        confidence=0.9,
-        converged=True,
-        reason="",
-        evidence=Evidence(overlap=0.6, support=0.8, likelihood=2.5, margin=0.2),
+    return made_up(
+        SOURCE,
+        target[20:],
+        transformation,
         hypotheses=[Hypothesis(np.diag([-1.0, -1, 1, 1]), 0.4), Hypothesis(np.diag([1.0, -1, -1, 1]), 0.3)],
-        max_correspondence_distance=0.05,
         information=np.diag(np.arange(1.0, 7.0)),
         matches=Matches(np.zeros((4, 3)), np.ones((4, 3)), np.full(4, 0.25)),
-        model="gnn-unseen-shapes",
-        seconds=0.1,
-        clouds=(SOURCE, target[20:]),
     )
 
 
@@ -58,7 +50,8 @@ def test_to_dict_is_ready_for_json(result: RegistrationResult) -> None:
     content = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert content["transformation"] == result.transformation.tolist()
     assert content["information"] == result.information.tolist()
-    assert content["evidence"] == {"overlap": 0.6, "support": 0.8, "likelihood": 2.5, "margin": 0.2}
+    assert content["evidence"] == asdict(EVIDENCE)
+    assert content["strength"] == {"motions": STRENGTH.motions.tolist(), "fixed": STRENGTH.fixed.tolist()}
     assert content["hypotheses"] == [
         {"transformation": np.diag([-1.0, -1, 1, 1]).tolist(), "score": 0.4},
         {"transformation": np.diag([1.0, -1, -1, 1]).tolist(), "score": 0.3},

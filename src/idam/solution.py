@@ -28,7 +28,7 @@ FEW_POINTS = 1024
 """Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
 
 
-DENSE = 500_000
+DENSE = 200_000
 """Points of each cloud that the last stage uses at most."""
 
 
@@ -96,8 +96,10 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle, given=guess is not None)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
-    start = align(surfaces, found.best, reaches(method)[1], method)
-    best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last=refine == "gicp")
+    # unless another method is asked for, the last stage takes over where there are more points than the fine clouds'
+    last = refine == "gicp" and clouds.fine.source_level.voxel_size != ALL
+    start = found.best if last else align(surfaces, found.best, reaches(method)[1], method)
+    best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last)
     poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
     return Solution(
         answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],
@@ -117,8 +119,5 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
 
 def dense(clouds: Pyramid) -> tuple[Dense, Dense]:
     """Both clouds in working units with all points, or every n-th."""
-    level = clouds.fine
-    if level.source_level.voxel_size == ALL:
-        return Dense.of_surface(level.surfaces.source), Dense.of_surface(level.surfaces.target)
     source, target = (Dense.of(cloud.every(DENSE) / clouds.unit) for cloud in (clouds.source, clouds.target))
     return source, target

@@ -27,7 +27,7 @@ def error(count: int, seed: int) -> float:
     thinned = [downsample(points, 0.03) for points in (source, target)]
     surfaces = Surfaces(*(Surface.of(points) for points in thinned), max(spacing_of(points) for points in thinned))
     start = TRUTH @ rigid.exp(rng.normal(scale=0.003, size=6))
-    found, _ = polish(surfaces, Dense.of(source), Dense.of(target), start)
+    found, _ = polish(surfaces, start, lambda: (Dense.of(source), Dense.of(target)))
     return float(np.linalg.norm(rigid.log(rigid.inverse(found) @ TRUTH)))
 
 

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from cheap import ENVIRONMENT, Cheap
 
+from cheap import ENVIRONMENT, Cheap
 from idam.batch.ledger import Ledger, read_run
 from idam.batch.pairs import Pair, as_pairs
 from idam.batch.rows import failed_row

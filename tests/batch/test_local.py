@@ -13,25 +13,18 @@ from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
-from cheap import ENVIRONMENT, Cheap, settled
-from processes import alive, count, descendants, processes, start, until
 
+from cheap import ENVIRONMENT, Named, Threads, settled
 from idam.batch import local
 from idam.batch.ledger import read_run
 from idam.batch.pairs import Pair, as_pairs, by_scan
 from idam.batch.rows import Row
+from killing import alive, count, descendants, processes, start, until
 
 
 def pairs_in(folder: Path, names: list[str]) -> list[Pair]:
     """A pair for each name, in a folder of its own to leave marks in."""
     return by_scan(as_pairs([{"source": str(folder / name), "target": "t", "id": name} for name in names]))
-
-
-class Named(Cheap):
-    """Cheap work on the file name of the source."""
-
-    def __call__(self, pair: Pair) -> Row:
-        return super().__call__(Pair(pair.id, Path(pair.source).name, "t", folder=str(Path(pair.source).parent)))
 
 
 def rows(folder: Path, names: list[str], jobs: int = 2, limit: float = 60.0) -> dict[str, Row]:
@@ -60,13 +53,6 @@ def test_a_pair_that_never_ends_is_stopped(tmp_path: Path) -> None:
     assert time.monotonic() - started < 60
     assert found["hang"]["error"] == "took longer than the limit of 0.5 s"
     assert [found[name]["status"] for name in "012"] == ["ok"] * 3
-
-
-class Threads(Cheap):
-    """Rows that say how many threads libraries may start."""
-
-    def __call__(self, pair: Pair) -> Row:
-        return super().__call__(pair) | {"reason": os.environ.get("OMP_NUM_THREADS")}
 
 
 def test_a_process_has_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -223,7 +223,9 @@ def test_interrupted_it_says_how_to_go_on(scans: Path) -> None:
     out, err = process.communicate(timeout=30)
     left = 1000 - kept_lines(scans / "run")
     assert (process.returncode, out) == (130, "")
-    assert err == f"idam: interrupted: {left} pairs are left: run the same command to go on\n"
+    said = re.fullmatch(r"idam: interrupted: (\d+) pairs are left: run the same command to go on\n", err)
+    assert said is not None
+    assert int(said[1]) in (left, left + 1)  # one may have been written at that moment
     with pytest.raises(ProcessLookupError):
         for _ in range(300):  # soon no process of it is left
             os.killpg(process.pid, 0)

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import idam
 from idam import RegistrationResult, cli, registration
 from idam.io import PointCloud, format_transform, read_point_cloud, read_transform, write_point_cloud
-from idam.network.pretrained import provenance
 from idam.report import view
+from idam.weights import provenance
+from motions import degrees, rotation
 
 
 class Run(NamedTuple):
@@ -44,7 +44,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud = PointCloud(points, random.integers(0, 256, (300, 3), dtype=np.uint8), normals)
     folder = tmp_path_factory.mktemp("scans")
     write_point_cloud(folder / "source.ply", cloud)
-    write_point_cloud(folder / "target.xyz", points @ Rotation.from_rotvec([0.4, 1.1, -0.3]).as_matrix().T + 3.0)
+    write_point_cloud(folder / "target.xyz", points @ rotation([0.4, 1.1, -0.3]).T + 3.0)
     return folder
 
 
@@ -312,8 +312,6 @@ def test_refuses_files(work: Path, call: Call, file: str, words: str) -> None:
         ("--refine", "magic", "gicp, plane, point, symmetric or none"),
         ("--seed", "one", "--seed"),
         ("--seed", "1" * 30, "seed"),
-        ("--device", "abacus", "abacus"),
-        ("--device", "cuda:99", "cuda:99"),
         ("--nonsense", "1", "--nonsense"),
     ],
 )
@@ -322,6 +320,14 @@ def test_refuses_options(work: Path, call: Call, option: str, value: str, words:
     before = files_in(work)
     assert_refused(call("register", "source.ply", "target.xyz", "-o", "out.ply", option, value), words)
     assert files_in(work) == before
+
+
+@pytest.mark.parametrize("device", ["abacus", "cuda:99"])
+def test_refuses_devices_that_a_network_cannot_run_on(work: Path, call: Call, device: str) -> None:
+    pytest.importorskip("torch", reason="the paper's networks need PyTorch: pip install 'idam[torch]'")
+    model = ("--model", "gnn-unseen-shapes")
+    assert_refused(call("register", "source.ply", "target.xyz", "-o", "out.ply", *model, "--device", device), device)
+    assert not (work / "out.ply").exists()
 
 
 OUTPUTS = {"-o": "a.ply", "--transform": "a.txt", "--json": "a.json", "--html": "a.html", "--save-plot": "a.png"}
@@ -412,10 +418,10 @@ def test_demo_writes_its_files(tmp_path: Path) -> None:
         assert str(path) in run.out
     matrix = read_transform(next(folder.glob("*.txt")))
     np.testing.assert_array_equal(printed_matrix(run.out), matrix)
-    with resources.as_file(resources.files("idam") / "data" / "demo") as shipped:
-        truth = np.loadtxt(shipped / "truth.txt")
-        source = read_point_cloud(shipped / "source.ply")
-    assert np.degrees(Rotation.from_matrix(matrix[:3, :3].T @ truth[:3, :3]).magnitude()) < 5.0
+    truth = np.loadtxt(str(resources.files("idam.lab.data") / "demo" / "truth.txt"))
+    with resources.as_file(resources.files("idam.demo") / "source.ply") as shipped:
+        source = read_point_cloud(shipped)
+    assert degrees(matrix, truth) < 5.0
     aligned = read_point_cloud(next(folder.glob("*.ply")))
     np.testing.assert_allclose(aligned.points, source.transformed(matrix).points, atol=1e-5)
 

@@ -150,6 +150,19 @@ def test_info_guesses_the_unit(work: Path, call: Call, points: np.ndarray, words
     assert words in call("info", "a.xyz").out
 
 
+# --- view ----------------------------------------------------------------------------------------------------------
+
+
+def test_view_writes_a_page_without_a_judgement(work: Path, call: Call) -> None:
+    code, out, err = call("view", "source.ply", "target.xyz", "T.txt", "--no-open")
+    assert (code, out, err) == (0, "look at view.html\n", "")
+    page = Path("view.html").read_text()
+    assert '<body class="unjudged">' in page and "source.ply" in page and "100.0 %" in page and "{{" not in page
+    call("view", "source.ply", "target.xyz", "-o", "apart.html", "--no-open")
+    assert "100.0 %" not in Path("apart.html").read_text()
+    assert_refused(call("view", "source.ply", "target.xyz", "-o", "source.ply"), "would overwrite an input")
+
+
 # --- register ------------------------------------------------------------------------------------------------------
 
 
@@ -171,6 +184,15 @@ def test_register_overwrites_no_input_and_no_other_output(work: Path, call: Call
     assert_refused(run)
     assert "overwrite an input" in run.err or "two outputs to one file" in run.err
     assert {path.name: path.read_bytes() for path in work.iterdir()} == before
+
+
+def test_register_names_the_file_at_fault(work: Path, call: Call) -> None:
+    Path("few.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n")
+    assert_refused(call("register", "source.ply", "few.xyz"), "few.xyz: has 3 points")
+    assert_refused(call("register", "few.xyz", "source.ply"), "few.xyz: has 3 points")
+    Path("nan.csv").write_text("name,x,y,z\nP,nan,0,0\n" + "".join(f"a,{x},{x * x % 7},{x % 5}\n" for x in range(40)))
+    run = call("register", "nan.csv", "nan.csv", "-v")
+    assert "left out columns that hold text: name" in run.err and "left out 1 points" in run.err
 
 
 def test_register_json_is_json_under_any_name(work: Path, call: Call) -> None:
@@ -223,6 +245,7 @@ def test_short_help(call: Call, args: tuple[str, ...]) -> None:
     assert (code, err) == (0, "") and "Usage" in out
 
 
-def test_shell_completion(call: Call) -> None:
-    code, out, _ = call("--show-completion", "bash")
-    assert code == 0 and "_IDAM_COMPLETE" in out
+def test_shell_completion() -> None:
+    asked = {"_IDAM_COMPLETE": "complete_bash", "COMP_WORDS": "idam app", "COMP_CWORD": "1"}
+    code, out, _ = launch("idam ", env={**os.environ, **asked})
+    assert (code, out.split()) == (0, ["apply"])

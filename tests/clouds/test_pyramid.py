@@ -103,15 +103,15 @@ def test_both_clouds_are_described_at_one_spacing(large: Pyramid) -> None:
         key = "noted"
 
         def describe(self, around: Surroundings) -> np.ndarray:
-            asked.append(np.ptp(around.points, axis=0).max())
+            asked.append(spacing_by_definition(around.points))
             return np.zeros((len(around.points), 2), np.float32)
 
     source, target = large.small.features(Noted())
     assert (len(source), len(target)) == (len(large.small.source), len(large.small.target))
-    assert len(asked) == 2
-    # in units of the sparser cloud's spacing, to the nearest rung
-    for size, points in zip(asked, (large.small.source, large.small.target), strict=True):
-        assert size == pytest.approx(np.ptp(points, axis=0).max() / large.small.spacing, rel=0.1)
+    # the points are in spacings of the sparser cloud
+    assert max(asked) == pytest.approx(1.0, rel=0.1)
+    both = [spacing_by_definition(points) for points in (large.small.source, large.small.target)]
+    assert asked[0] / asked[1] == pytest.approx(both[0] / both[1], rel=1e-5)
 
 
 # --- voxel_size ----------------------------------------------------------------------------------------------------

@@ -238,7 +238,8 @@ def test_ply_moved_far_away_becomes_double(tmp_path: Path) -> None:
 
 
 def test_obj_moves_line_by_line(tmp_path: Path) -> None:
-    text = "mtllib a.mtl\nv 1 0 0 0.5 0.5 0.5\nv 0 1 0 1 0 0\nv 0 0 1 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\nf 1/1/1 2/1/1 3/1/1\n"
+    text = "mtllib a.mtl\nv 1 0 0 0.5 0.5 0.5\nv 0 1 0 1 0 0\nv 0 0 1 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\n"
+    text += "f 1/1/1 2/1/1 3/1/1\n"
     (tmp_path / "a.obj").write_text(text)
     move_file(tmp_path / "a.obj", MOTION, tmp_path / "b.obj")
     lines, before = (tmp_path / "b.obj").read_text().splitlines(), text.splitlines()
@@ -405,6 +406,19 @@ def test_e57_is_written_with_poses_and_far_from_the_origin(tmp_path: Path) -> No
     move_file(tmp_path / "b.e57", MOTION, tmp_path / "c.e57")
     for before, after in zip(read_scans(tmp_path / "b.e57"), read_scans(tmp_path / "c.e57"), strict=True):
         np.testing.assert_allclose(after.placed().points, rigid.apply(MOTION, before.placed().points), atol=1e-6)
+
+
+def test_e57_of_spherical_coordinates() -> None:
+    from idam.io.e57 import _points
+
+    columns = {"sphericalRange": [2.0, 3], "sphericalAzimuth": [0.5, 0], "sphericalElevation": [0.25, np.pi / 2]}
+    found = _points({name: np.array(values) for name, values in columns.items()}, 1)
+    flat = 2 * np.cos(0.25)
+    np.testing.assert_allclose(
+        found, [[flat * np.cos(0.5), flat * np.sin(0.5), 2 * np.sin(0.25)], [0, 0, 3]], atol=1e-15
+    )
+    with pytest.raises(InputError, match="scan 1 has no coordinates"):
+        _points({"intensity": np.zeros(2)}, 1)
 
 
 def test_e57_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,19 +47,20 @@ def test_digits_of_far_coordinates_are_all_there() -> None:
 YAWED = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])  # 90 degrees about z
 HALF = repr(float(np.sqrt(0.5)))
 QUARTER = repr(float(np.pi) / 2)
+GEOMETRY = '{"translation": {"x": 1, "y": 2, "z": 3}, "rotation": {"x": 0, "y": 0, "z": HALF, "w": HALF}}'
 PASTED = {
     "matrix": "0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1",
     "NumPy": "[[0. -1. 0. 1.]\n [1. 0. 0. 2.]\n [0. 0. 1. 3.]\n [0. 0. 0. 1.]]",
     "Python": "np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])",
-    "CloudCompare's console": "[14:02:11] 0.0 -1.0 0.0 1.0\n[14:02:11] 1.0 0.0 0.0 2.0\n[14:02:11] 0 0 1 3\n[14:02:11] 0 0 0 1",
+    "CloudCompare's console": "[14:02:11] 0 -1 0.0 1\n[14:02:11] 1 0 0 2\n[14:02:11] 0 0 1 3\n[14:02:11] 0 0 0 1",
     "KITTI": "0 -1 0 1 1 0 0 2 0 0 1 3",
     "TUM": f"1700000000.25 1 2 3 0 0 {HALF} {HALF}",
     "TUM with a comment": f"# timestamp tx ty tz qx qy qz qw\n0 1 2 3 0 0 {HALF} {HALF}",
     "ROS 1": f"rosrun tf2_ros static_transform_publisher 1 2 3 {QUARTER} 0 0 map scan",
     "ROS 1 with a period": f"rosrun tf static_transform_publisher 1 2 3 0 0 {HALF} {HALF} map scan 100",
-    "ROS 2": f"ros2 run tf2_ros static_transform_publisher --x 1 --y 2 --z 3 --yaw {QUARTER} --frame-id map --child-frame-id a",
+    "ROS 2": f"ros2 run tf2_ros static_transform_publisher --x 1 --y 2 --z 3 --yaw {QUARTER} --frame-id map",
     "ROS 2 arguments alone": f"--x 1 --y 2 --z 3 --qz {HALF} --qw {HALF} --frame-id map --child-frame-id scan",
-    "tf2_echo": f"At time 0.0\n- Translation: [1.000, 2.000, 3.000]\n- Rotation: in Quaternion [0.000, 0.000, {HALF}, {HALF}]\n"
+    "tf2_echo": f"At time 0.0\n- Translation: [1.000, 2.000, 3.000]\n- Rotation: in Quaternion [0, 0, {HALF}, {HALF}]\n"
     f"            in RPY (radian) [0.0, 0.0, {QUARTER}]\n            in RPY (degree) [0.0, -0.0, 90.0]",
     "quaternion xyzw": f"translation: 1 2 3\nquaternion xyzw: 0 0 {HALF} {HALF}",
     "quaternion wxyz": f"quaternion (wxyz) = [{HALF}, 0, 0, {HALF}], translation = [1, 2, 3]",
@@ -68,7 +69,7 @@ PASTED = {
     "Euler intrinsic": f"euler ZYX intrinsic radians {QUARTER} 0 0\ntranslation 1 2 3",
     "roll, pitch, yaw": "t: 1 2 3  rpy (deg): 0 0 90",
     "ypr": "t: 1 2 3  ypr deg: 90 0 0",
-    "geometry_msgs": f'{{"translation": {{"x": 1, "y": 2, "z": 3}}, "rotation": {{"x": 0, "y": 0, "z": {HALF}, "w": {HALF}}}}}',
+    "geometry_msgs": GEOMETRY.replace("HALF", HALF),
     "flat JSON": '{"matrix": [0, -1, 0, 1, 1, 0, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]}',
 }  # fmt: skip
 

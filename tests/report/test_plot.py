@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from idam.search.confidence import Evidence
 
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.result import Matches, RegistrationResult
+from results import made_up
 
 matplotlib = pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
 
@@ -41,22 +41,8 @@ def result(target: np.ndarray) -> RegistrationResult:
     transformation = np.array([[0.0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     weight = np.arange(60.0) - 20
     source = (target - transformation[:3, 3]) @ transformation[:3, :3]
-    return RegistrationResult(
-        transformation=transformation,
-        fitness=0.9,
-        inlier_rmse=0.01,
-        correspondence_set=np.zeros((0, 2), np.int64),
-        confidence=0.871,
-        converged=True,
-        reason="",
-        hypotheses=[],
-        evidence=Evidence(overlap=0.5, support=0.9, likelihood=1.5, margin=0.2),
-        max_correspondence_distance=0.05,
-        information=np.zeros((6, 6)),
-        matches=Matches(source[:60], target[:60], weight.clip(0) / weight.clip(0).sum()),
-        model="default",
-        seconds=0.1,
-    )
+    matches = Matches(source[:60], target[:60], weight.clip(0) / weight.clip(0).sum())
+    return made_up(source, target, transformation, confidence=0.871, matches=matches)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from idam.clouds.surfaces import SAME_SURFACE, TOUCHING, Surface, Surfaces
-from idam.search.overlap import overlap
+from idam.search.overlap import exactness, overlap, shares
 from motions import move, rigid
 from solids import distances, shell
 
@@ -74,3 +74,75 @@ def test_surfaces_that_cross_do_not_overlap() -> None:
     clouds = pair(plane, move(POSE, other))
     assert overlap(clouds, POSE, reach=4.0) > 0.98
     assert overlap(clouds, POSE @ rigid([np.pi / 2, 0, 0], [0, 0, 0]), reach=4.0) < 0.1
+
+
+# --- the shares ----------------------------------------------------------------------------------------------------
+
+
+def test_shares_are_those_of_brute_force_point_by_point(overlapping: Surfaces) -> None:
+    def share(own: Surface, other: Surface, matrix: np.ndarray) -> float:
+        lie = 0
+        for point, normal in zip(move(matrix, own.points), own.normals @ matrix[:3, :3].T, strict=True):
+            distance = np.linalg.norm(other.points - point, axis=1)
+            near = int(distance.argmin())
+            lie += distance[near] <= 2.0 * SPACING and abs(normal @ other.normals[near]) >= SAME_SURFACE
+        return lie / len(own.points)
+
+    mine, theirs = shares(overlapping, POSE, 2.0)
+    assert mine == share(overlapping.source, overlapping.target, POSE)
+    assert theirs == share(overlapping.target, overlapping.source, np.linalg.inv(POSE))
+    assert mine != theirs
+    assert overlap(overlapping, POSE, 2.0) == pytest.approx((mine * theirs) ** 0.5, abs=1e-12)
+
+
+def test_shares_swap_with_the_clouds(overlapping: Surfaces) -> None:
+    assert shares(overlapping.swapped(), np.linalg.inv(POSE)) == shares(overlapping, POSE)[::-1]
+
+
+def test_all_of_a_part_lies_on_the_whole_and_little_of_the_whole_on_the_part() -> None:
+    whole = shell(800, 1)
+    part = whole[whole[:, 0] > 0.5]
+    mine, theirs = shares(pair(part, whole), np.eye(4))
+    assert mine > 0.9
+    assert theirs < 0.4
+
+
+# --- how exactly ---------------------------------------------------------------------------------------------------
+
+
+def exactness_by_definition(surfaces: Surfaces, matrix: np.ndarray, reach: float) -> tuple[float, float]:
+    distances_, off = [], []
+    ways = ((surfaces.source, surfaces.target, matrix), (surfaces.target, surfaces.source, np.linalg.inv(matrix)))
+    for own, other, way in ways:
+        for point in move(way, own.points):
+            gaps = other.points - point
+            near = int(np.linalg.norm(gaps, axis=1).argmin())
+            if np.linalg.norm(gaps[near]) <= reach:
+                distances_.append(np.linalg.norm(gaps[near]))
+                off.append(abs(gaps[near] @ other.normals[near]))
+    if not off:
+        return 0.0, 1.0
+    return float(np.mean(np.array(distances_) <= TOUCHING * surfaces.spacing)), float(np.median(off)) / reach
+
+
+@pytest.mark.parametrize(
+    "matrix", [POSE, POSE @ rigid([0.05, 0.0, 0.0], [0.02, 0.0, 0.03]), rigid([0, 0, 0], [9, 0, 0])]
+)
+@pytest.mark.parametrize("reach", [0.1, 0.4])
+def test_exactness_is_that_of_the_definition(overlapping: Surfaces, matrix: np.ndarray, reach: float) -> None:
+    expected = exactness_by_definition(overlapping, matrix, reach)
+    np.testing.assert_allclose(exactness(overlapping, matrix, reach), expected, rtol=1e-9)
+
+
+def test_exactness_swaps(overlapping: Surfaces) -> None:
+    back = exactness(overlapping.swapped(), np.linalg.inv(POSE), 0.3)
+    np.testing.assert_allclose(back, exactness(overlapping, POSE, 0.3), rtol=1e-9)
+
+
+def test_clouds_come_apart_at_a_fine_resolution_where_they_only_seem_to_touch() -> None:
+    points = shell(2000, 1)
+    fine = Surfaces(Surface.of(points), Surface.of(shell(2000, 2)), 0.02)
+    close, off = zip(*(exactness(fine, rigid([0, 0, 0], [0, 0, shift]), 0.2) for shift in (0, 0.05, 0.1)), strict=True)
+    assert close[0] > close[1] > close[2]
+    assert off[0] < off[1] < off[2] <= 1.0
+    assert exactness(fine, rigid([0, 0, 0], [9.0, 0, 0]), 0.2) == (0.0, 1.0)

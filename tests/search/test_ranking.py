@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from idam.align import align, reaches
+from idam.clouds.surfaces import TOUCHING, Surface, Surfaces, spacing_of
+from idam.clouds.viewpoint import DepthMap, FreeSpace
 from idam.search.matching import FEW, FeatureMatches, Matching
-from idam.search.overlap import overlap
-from idam.search.ranking import UNLIKELY, Answer, distinct, improve, likeliest, ranked, same, scored
+from idam.search.overlap import exactness, overlap, shares
+from idam.search.ranking import (
+    MOST_VIOLATION,
+    UNLIKELY,
+    VIOLATION,
+    Answer,
+    distinct,
+    improve,
+    likeliest,
+    ranked,
+    same,
+    scored,
+    verified,
+)
 from matchings import level, matching_by, scores_for
 from motions import degrees as angle_between
 from motions import rigid as by_vector
+from rooms import room
 from solids import boxes
 
 CORNERS = [([0, 0, 0], [1, 0.6, 0.2]), ([0, 0, 0.2], [0.2, 0.6, 0.8]), ([0.6, 0.1, 0.2], [0.9, 0.3, 0.5])]
@@ -97,6 +115,16 @@ def test_wrong_contact_ranks_below_less_overlap_of_points_that_are_alike() -> No
     assert Answer(rigid(), overlap=0.2, likelihood=-0.1).score < Answer(rigid(), overlap=0.4, likelihood=-0.5).score
 
 
+def test_points_in_free_space_halve_a_score_and_count_up_to_a_point() -> None:
+    def score(violation: float) -> float:
+        return Answer(rigid(), overlap=0.5, likelihood=2.0, violation=violation).score
+
+    assert score(VIOLATION) == pytest.approx(score(0.0) / 2)
+    scores = [score(x) for x in np.linspace(0, MOST_VIOLATION, 6)]
+    assert scores == sorted(set(scores), reverse=True)
+    assert score(0.5) == score(MOST_VIOLATION) > 0
+
+
 # --- improving -----------------------------------------------------------------------------------------------------
 
 
@@ -119,7 +147,10 @@ def test_improve_without_refinement_only_scores(matching: Matching) -> None:
         assert (answer.transformation == start).all()
         assert answer.support == matching.matches.support(start)
         assert answer.likelihood == matching.likelihood(start)
-        assert answer.overlap == overlap(surfaces, start)
+        assert answer.overlap == pytest.approx(overlap(surfaces, start), abs=1e-12)
+        assert answer.contained == max(shares(surfaces, start))
+        # what nobody has looked at yet speaks against it
+        assert (answer.close, answer.off, answer.violation) == (0.0, 1.0, 0.0)
         assert answer.border == 1.0
     assert max(found, key=lambda answer: answer.score) is found[2]
     assert found[2].support == pytest.approx(20 / (30 + FEW))
@@ -165,3 +196,50 @@ def test_the_likeliest_come_first_and_no_more_than_asked_for(matching: Matching)
 def test_of_equally_likely_ones_the_first_comes_first(matching: Matching) -> None:
     far = np.array([rigid(10 * n, 50.0) for n in range(5)])  # nothing is said of any
     np.testing.assert_array_equal(likeliest(far, matching, 3), far[:3])
+
+
+# --- on the fine clouds --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fine() -> Surfaces:
+    """The same part, sampled more densely."""
+    source, target = (boxes(CORNERS, 3000, seed) - 0.3 for seed in (3, 4))
+    return Surfaces(Surface.of(source), Surface.of(target), spacing_of(source))
+
+
+@pytest.mark.parametrize("method", ["none", "gicp"])
+def test_verified_is_refined_on_the_fine_clouds_and_measured_there(
+    matching: Matching, fine: Surfaces, method: str
+) -> None:
+    (answer,) = improve(np.array([rigid(2, 0.01)]), matching, 1.0, "none")
+    checked = verified(answer, matching, fine, method)
+    expected = align(fine, answer.transformation, reaches(method)[1], method, 6)
+    np.testing.assert_array_equal(checked.transformation, expected)
+    reach = TOUCHING * matching.clouds.surfaces.spacing
+    assert (checked.close, checked.off) == exactness(fine, checked.transformation, reach)
+    # what the matched clouds said of it stays
+    for name in ("overlap", "contained", "support", "likelihood", "border"):
+        assert getattr(checked, name) == getattr(answer, name)
+
+
+def test_verified_tells_what_only_seems_to_touch_from_the_truth(matching: Matching, fine: Surfaces) -> None:
+    right, near = (verified(Answer(pose), matching, fine, "none") for pose in (rigid(), rigid(4, 0.03)))
+    assert right.close > near.close
+    assert right.off < near.off
+    refined = verified(Answer(rigid(4, 0.03)), matching, fine, "gicp")
+    assert angle_between(refined.transformation, np.eye(4)) < 1.0
+    assert refined.off < near.off
+
+
+def test_answers_are_asked_what_they_lay_in_free_space() -> None:
+    seen = room(3000)
+    space = FreeSpace(seen, seen, None, DepthMap.of(seen, np.zeros(3)), 0.05)
+    clouds = replace(level(seen, seen), free_space=space)
+    matching = matching_by(clouds, np.zeros((3000, 3000)))
+    wrong = by_vector([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    right, slid = improve(np.array([np.eye(4), wrong]), matching, 1.0, "none")
+    assert right.violation == 0.0
+    assert slid.violation == space.violation(wrong) > 0.05
+    checked = verified(Answer(wrong), matching, clouds.surfaces, "none")
+    assert checked.violation == slid.violation

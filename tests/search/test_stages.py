@@ -6,20 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from idam.search.confidence import CLOSE, CONVERGED, Evidence, confidence
 
 from idam.clouds.prepared import Prepared
 from idam.clouds.pyramid import Pyramid
 from idam.describe.invariant import Descriptor, Surroundings
+from idam.search.judge import CONVERGED, confidence, evidence, weight
 from idam.search.matching import FeatureMatches
-from idam.search.ranking import Answer, same
+from idam.search.ranking import Answer, same, scored
 from idam.search.scope import Scope
 from idam.search.stages import (
     CONTENDERS,
     SURE,
     TAUGHT,
+    TIED,
+    VERIFIED,
     Found,
     Network,
+    explain,
     first_of_its_kind,
     judged,
     least_turned,
@@ -54,7 +57,7 @@ def look(
     scope: Scope = ALL,
     method: str = "gicp",
     network: Network | None = None,
-    descriptor: Descriptor | Speechless | None = None,
+    descriptor: Descriptor | None = None,
 ) -> Found:
     return search(clouds, descriptor or load_descriptor(), network, scope, method)
 
@@ -149,7 +152,7 @@ def test_of_a_symmetric_object_s_poses_the_one_nearest_to_the_guess_comes_first(
     clouds = pyramid(box((1.2, 0.8, 0.5), 2500, seed=1), move(turn, box((1.2, 0.8, 0.5), 2500, seed=2)))
     found = look(clouds, Scope(half_turn))
     assert degrees(found.best, turn @ half_turn) < 3
-    assert found.evidence.margin < CLOSE
+    assert found.evidence.lead < TIED  # and it is hardly ahead of the others, if at all
 
 
 # --- a network -----------------------------------------------------------------------------------------------------
@@ -196,7 +199,7 @@ def test_of_poses_alike_the_network_chooses_among_those_it_was_taught(prism: Pyr
     np.testing.assert_allclose(found.best, about_z(-50), atol=0.07)
     # there is another, and the answer is no surer for being chosen
     assert any(np.allclose(other.transformation, about_z(40), atol=0.07) for other in found.answers[1:])
-    assert found.evidence.margin < CLOSE
+    assert found.evidence == evidence(found.answers)
     without = look(prism, Scope(np.eye(4), TAUGHT), "symmetric")
     np.testing.assert_allclose(without.best, about_z(40), atol=0.07)
 
@@ -212,10 +215,10 @@ def test_a_network_that_is_far_off_chooses_nothing(prism: Pyramid) -> None:
 
 def test_answers_are_unlike_each_other_the_best_first(unrelated: Pyramid) -> None:
     found = look(unrelated)
-    scores = [answer.score for answer in found.answers]
-    assert 1 < len(scores) <= CONTENDERS
-    assert scores[1:] == sorted(scores[1:], reverse=True)
-    assert scores[0] >= (1 - CLOSE) * max(scores)
+    assert 1 < len(found.answers) <= CONTENDERS
+    looked_at = [weight(answer) for answer in found.answers if answer.close > 0]
+    assert looked_at[1:] == sorted(looked_at[1:], reverse=True)
+    assert looked_at[0] >= max(looked_at) - TIED
     for n, answer in enumerate(found.answers):
         assert not any(same(answer.transformation, other.transformation) for other in found.answers[:n])
 
@@ -224,9 +227,16 @@ def turned(angle: float, likelihood: float) -> Answer:
     return Answer(about_z(angle), likelihood=likelihood)
 
 
+def behind(best: Answer, logits: float, angle: float) -> Answer:
+    """An answer that weighs so much less than another."""
+    slope = weight(Answer(np.eye(4), overlap=1.0)) - weight(Answer(np.eye(4)))
+    return replace(best, transformation=about_z(angle), overlap=best.overlap - logits / slope)
+
+
 def test_of_answers_as_good_as_the_best_the_one_nearest_to_the_guess_comes_first() -> None:
-    best, turn, slight = turned(180, 1.0), turned(90, 0.98), turned(20, 0.95)
-    worse = turned(0, 0.99 - CLOSE)
+    best = Answer(about_z(180), overlap=0.9, likelihood=1.0)
+    turn, slight = behind(best, 0.4 * TIED, 90), behind(best, 0.9 * TIED, 20)
+    worse = behind(best, 1.1 * TIED, 0)
     assert least_turned([best, turn, slight, worse], np.eye(4)) == [slight, best, turn, worse]
     assert least_turned([best, turn, slight, worse], about_z(100)) == [turn, best, slight, worse]
     assert least_turned([best], np.eye(4)) == [best]
@@ -258,30 +268,62 @@ def test_weights_of_the_matches_sum_to_one_or_are_all_nothing(holding: Found) ->
     np.testing.assert_array_equal(nowhere.weights, np.zeros(60))
 
 
-def test_evidence_is_that_of_the_first_answer_and_the_margin_of_the_only_one_is_whole(holding: Found) -> None:
-    assert holding.evidence == Evidence(overlap=0.9, support=0.5, likelihood=2.5, margin=1.0)
-    assert replace(holding, answers=[*holding.answers, Answer(FAR)]).evidence.margin == 1.0
+def test_evidence_is_what_the_judge_is_told_of_the_first_and_of_the_others(holding: Found) -> None:
+    assert holding.evidence == evidence(holding.answers)
+    other = Answer(FAR, overlap=0.8)
+    two = replace(holding, answers=[*holding.answers, other])
+    assert two.evidence.overlap == 0.9
+    assert two.evidence.lead == pytest.approx(min(weight(holding.answers[0]) - weight(other), holding.evidence.lead))
 
 
-def test_margin_is_how_much_less_the_next_best_scores_as_a_share(holding: Found) -> None:
-    def margin(*answers: Answer) -> float:
-        return replace(holding, answers=list(answers)).evidence.margin
-
-    best, second, third = (Answer(rigid([x, 0, 0], [0, 0, 0]), likelihood=x) for x in (2.0, 0.5, 0.3))
-    assert margin(best, second, third) == margin(best, third, second) == pytest.approx(0.75)
-    assert margin(best, replace(best, transformation=FAR)) == 0.0
-    # first because it turns least, though another is a little better
-    assert margin(second, best) == 0.0
-    # nothing touches
-    assert margin(Answer(FAR)) == margin(Answer(FAR), Answer(np.eye(4))) == 0.0
+@pytest.fixture(scope="module")
+def likely() -> Found:
+    """Two samplings of one part, and features that know it."""
+    clouds = level(bracket(500, seed=1), move(TRUTH, bracket(500, seed=2)))
+    return Found([], matching_by(clouds, scores_for(clouds, TRUTH)))
 
 
-def test_those_that_may_be_right_are_refined_and_those_that_end_alike_are_one(holding: Found) -> None:
-    surfaces = holding.matching.clouds.surfaces
-    near = rigid([0.03, 0.0, -0.02], [0.01, 0.0, 0.0]) @ TRUTH
-    beside = TRUTH @ rigid([0.0, 0.2, 0.0], [0.02, 0.0, 0.0])
-    far = TRUTH @ about_z(120)
-    answers = [Answer(x, likelihood=y) for x, y in ((near, 0.5), (beside, 0.4), (far, 0.01))]
-    best, *others = judged(answers, holding.matching, "point", surfaces)
-    np.testing.assert_allclose(best.transformation, TRUTH, atol=1e-3)
-    np.testing.assert_array_equal([answer.transformation for answer in others], [far])
+def test_explained_are_the_likeliest_and_of_poses_alike_one(likely: Found) -> None:
+    matching = likely.matching
+    beside = TRUTH @ rigid([0.06, 0.0, 0.05], [0.01, 0.0, 0.0])
+    off = TRUTH @ rigid([0.0, 0.0, 2.0], [0.0, 0.0, 0.0])
+    found = explain(np.array([off, beside, TRUTH, FAR]), matching, ALL, "gicp", matching.clouds.surfaces)
+    np.testing.assert_allclose(found.best, TRUTH, atol=0.03)
+    assert found.matching is matching
+    for n, answer in enumerate(found.answers):
+        assert not any(same(answer.transformation, other.transformation) for other in found.answers[:n])
+
+
+def test_judged_are_ordered_by_weight_and_those_out_of_the_question_left_as_they_are(likely: Found) -> None:
+    matching, fine = likely.matching, likely.matching.clouds.surfaces
+    good = scored(TRUTH, matching, sparse=False)
+    poor = scored(TRUTH @ rigid([0.0, 0.0, 2.0], [0.3, 0.0, 0.0]), matching, sparse=False)
+    assert poor.score < 0.3 * good.score
+    first, last = judged([good, poor], matching, "gicp", fine)
+    assert first.close > 0
+    assert last is poor
+    # what was a little better before is worse when it is looked at closely
+    slid = replace(good, transformation=TRUTH @ rigid([0.0, 0.0, 0.3], [0.1, 0.0, 0.0]), overlap=good.overlap - 0.01)
+    answers = judged([replace(slid, likelihood=1.01 * good.likelihood), good], matching, "none", fine)
+    np.testing.assert_array_equal(answers[0].transformation, TRUTH)
+    weights = [weight(answer) for answer in answers]
+    assert weights == sorted(weights, reverse=True)
+
+
+def test_judged_are_one_where_two_starts_end_in_one_pose(likely: Found) -> None:
+    matching, fine = likely.matching, likely.matching.clouds.surfaces
+    starts = [TRUTH @ rigid([0.0, 0.0, angle], [0.0, 0.0, 0.0]) for angle in (0.1, -0.1)]
+    assert not same(*starts)
+    answers = [scored(start, matching, sparse=False) for start in starts]
+    (one,) = judged(answers, matching, "gicp", fine)
+    np.testing.assert_allclose(one.transformation, TRUTH, atol=0.03)
+
+
+def test_no_more_are_looked_at_closely_than_there_is_time_for(likely: Found) -> None:
+    matching, fine = likely.matching, likely.matching.clouds.surfaces
+    good = scored(TRUTH, matching, sparse=False)
+    answers = [replace(good, transformation=about_z(50 * n)) for n in range(VERIFIED + 2)]
+    found = judged(answers, matching, "none", fine)
+    assert len(found) == len(answers)
+    assert [answer is other for answer, other in zip(found[-2:], answers[-2:], strict=True)] == [True, True]
+    assert not any(answer is other for answer in found[:VERIFIED] for other in answers)

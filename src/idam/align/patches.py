@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from idam import rigid
-from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surface, Surfaces
+from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surfaces
 from idam.rigid import Array
 
 __all__ = ["Dense", "Pairs", "Patches", "patch_size"]
@@ -48,11 +48,6 @@ class Dense:
         import small_gicp
 
         return cls(points, small_gicp.KdTree(points))
-
-    @classmethod
-    def of_surface(cls, surface: Surface) -> Dense:
-        """All points of a surface, whose tree is there."""
-        return cls(surface.points, surface.tree)
 
     def patches(self, places: Array, size: int) -> tuple[Patches, Array, Array]:
         """The means of the ``size`` points nearest to each of the places (C, 3), with normals of more where few.

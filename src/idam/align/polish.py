@@ -14,9 +14,9 @@ from idam.rigid import Array
 
 __all__ = ["finished", "polish"]
 
-ITERATIONS = 12
+ITERATIONS = 6
 """At most."""
-STILL = 1e-6
+STILL = 5e-6
 """Length of a step, in radians and working units, from which on it is done."""
 FEWEST = 30
 """Pairs of patches below which the start stays."""
@@ -38,23 +38,26 @@ def finished(
     """
     if method == "symmetric" and copies(surfaces, start):
         return start, Pairs.of_points(surfaces, start).each_way()
-    return polish(surfaces, *dense(), start) if last else (start, Pairs.of_points(surfaces, start))
+    if not last:
+        return start, Pairs.of_points(surfaces, start)
+    return polish(surfaces, start, dense)
 
 
-def polish(surfaces: Surfaces, source: Dense, target: Dense, start: Array) -> tuple[Array, Pairs]:
+def polish(surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Dense, Dense]]) -> tuple[Array, Pairs]:
     """Lay points of both surfaces on each other and then, where noise goes past the spacing, means of many points.
 
     Args:
         surfaces: in working coordinates, thinned.
-        source: as many of its points as there are, not thinned by voxels: the mean of a voxel that noise just reaches
-            weighs as much as that of a full one, and whole walls are off by a part of the noise.
-        target: likewise.
         start: (4, 4), off by less than the spacing of the surfaces' points.
+        dense: makes source and target with as many of their points as there are, not thinned by voxels: the mean of a
+            voxel that noise just reaches weighs as much as that of a full one, and whole walls are off by a part of the
+            noise.
 
     Returns:
         The transform (4, 4), and the pairs under it that fixed it.
     """
     found = _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
+    source, target = dense()
     places = surfaces.source.points
     size = max(patch_size(source, places), patch_size(target, surfaces.target.points))
     if size == 1:

@@ -66,7 +66,7 @@ def run(
             fn_constructor_kwargs={"build": build, "limit": limit},
             batch_size=None,
             num_cpus=1,
-            compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(jobs or blocks, blocks)),
+            compute=ray.data.ActorPoolStrategy(min_size=min(jobs or 1, blocks), max_size=min(jobs or blocks, blocks)),
         )
         for batch in rows.iter_batches(batch_size=None):
             yield from map(json.loads, batch["row"])

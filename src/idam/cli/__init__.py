@@ -21,6 +21,7 @@ from idam.cli.models import models
 from idam.cli.register import register
 from idam.cli.shared import BAD_INPUT
 from idam.cli.train import train
+from idam.cli.view import view
 from idam.errors import InputError, MissingDependencyError
 
 __all__ = ["main"]
@@ -78,6 +79,6 @@ def about(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-for command in (register, merge, batch, apply, info, demo, models, train, evaluate, figures):
+for command in (register, merge, batch, apply, info, view, demo, models, train, evaluate, figures):
     app.command()(command)
 app.add_typer(data, name="data")

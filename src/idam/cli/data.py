@@ -11,21 +11,24 @@ import typer
 
 __all__ = ["data"]
 
-data = typer.Typer(help="Fetch the data that models are trained and measured on.", no_args_is_help=True)
+data = typer.Typer(help="Download the data that models are trained and evaluated on.", no_args_is_help=True)
 
 
 @data.callback()
 def about_data() -> None:
-    """Fetch the data that models are trained and measured on."""
+    """Download the data that models are trained and evaluated on."""
 
 
 @data.command()
 def modelnet40(
-    folder: Annotated[Path, typer.Argument(help="Where to put it, then to be given as --data.")],
-    url: Annotated[str | None, typer.Option(help="Of the archive, where the usual address does not answer.")] = None,
+    folder: Annotated[Path, typer.Argument(help="Where to put it; give the folder printed as --data.")],
+    url: Annotated[str | None, typer.Option(help="Of the archive, if the usual address does not answer.")] = None,
     sha256: Annotated[str | None, typer.Option(help="Of the archive, to check before unpacking.")] = None,
 ) -> None:
-    """Download ModelNet40 (435 MB) and unpack it, go on with a broken download, or check a folder that has it."""
+    r"""Download ModelNet40 (435 MB) and unpack it. Needs idam\[lab].
+
+    A broken download is resumed. A folder that has the data is checked.
+    """
     from idam.lab.data.download import MODELNET40_URL, fetch_modelnet40
 
     with download_bar() as advance:

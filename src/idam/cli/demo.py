@@ -13,9 +13,9 @@ __all__ = ["demo"]
 
 
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the page and the aligned cloud.")] = Path(
-        "out"
-    ),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the page, the aligned cloud and the transform.")
+    ] = Path("out"),
 ) -> None:
     """Align two shipped scans of a CAD part, seen by a depth camera from 60 degrees apart."""
     from idam.demo import run

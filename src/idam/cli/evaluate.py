@@ -28,29 +28,33 @@ def evaluate(
     ] = None,
     method: Annotated[
         list[str] | None,
-        typer.Option(help="Rows to compute, or your own package.module:function; all rows if left out."),
+        typer.Option(help="Method to measure, or your own package.module:function; all methods if left out."),
     ] = None,
     model: Annotated[
         str | None,
         typer.Option(
-            help="Weights for the learned rows; those trained for the experiment if left out. Of the ablation, the "
+            help="Weights of the learned methods; those trained for the experiment if left out. For the ablation, the "
             "folder that benchmarks/ablation.py wrote, or that IDAM_ABLATION names."
         ),
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the one method asked for."),
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the method."),
     ] = None,
     within: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="DEGREES DISTANCE", help="With --pairs: errors up to which an answer is right. [5 0.05]"),
+        typer.Option(
+            metavar="DEGREES DISTANCE", help="With --pairs: largest errors of a right answer; 5 0.05 if left out."
+        ),
     ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only so many pairs, for a quick look.")] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the pairs.")] = 1,
-    json: Annotated[Path | None, typer.Option("--json", help="Write the rows here, after each of them.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep the rows that the JSON file has already.")] = False,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many pairs.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the results here, after each method.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the results that are in the JSON file.")] = False,
 ) -> None:
-    """Measure methods on the pairs of an experiment, or on your own; the paper's figures stand in brackets.
+    r"""Measure methods on the pairs of an experiment or on your own. Needs idam\[lab].
+
+    The paper's figures stand in brackets.
 
     [bold]Examples[/bold]
 

@@ -16,12 +16,15 @@ def figures(
     output: Annotated[Path, typer.Argument(help="Folder for the figures, each as PNG and SVG.")],
     data: Data,
     scans: Annotated[
-        list[Path] | None, typer.Option("--scan", help="Scans to register without fine-tuning: source, target, ...")
+        list[Path] | None,
+        typer.Option("--scan", help="Scans to register, by the network alone: source, target, source, ..."),
     ] = None,
-    speed: Annotated[Path | None, typer.Option(help="Times that benchmarks/speed.py --json wrote, to plot.")] = None,
+    speed: Annotated[
+        Path | None, typer.Option(help="Times to plot, a file that benchmarks/speed.py --json wrote.")
+    ] = None,
     model: Annotated[str, typer.Option(help="Weights for the figures with noise.")] = "gnn-gaussian-noise",
 ) -> None:
-    """Draw the figures of the paper's appendix B, and curves of error, validity and speed.
+    r"""Draw the figures of the paper's appendix B and curves of error, validity and speed. Needs idam\[lab].
 
     [bold]Example[/bold]
 

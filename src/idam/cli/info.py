@@ -27,7 +27,7 @@ def info(file: Annotated[Path, typer.Argument(help="A cloud, a mesh or a transfo
     from idam.errors import InputError
     from idam.io import Mesh, read_content, read_transform
 
-    if file.suffix.lower() in TRANSFORM_SUFFIXES:
+    if file != Path("-") and file.suffix.lower() in TRANSFORM_SUFFIXES:
         try:
             return show_transform(read_transform(file))
         except InputError:

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 __all__ = ["models"]
 
+USES = {
+    "general": "scans of any kind, in any pose: what 'idam register' uses unless told otherwise",
+    "practice-any-rotation": "sparse, noisy clouds of single objects, in any pose",
+    "gnn-practice": "the same with rotations of up to 90 degrees (--max-angle 90), after practice-any-rotation+",
+    "gnn-gaussian-noise": "the paper's experiment; symmetric objects that stand upright, with --max-angle 90",
+}
+"""What to choose a model for; all others are for the paper's experiments."""
+
 
 def models() -> None:
-    """List the shipped models: what they were trained on and how they did."""
-    from idam.weights import list_models, provenance
+    """List the shipped models: what each is for, what it was trained on, and its validation errors."""
+    from idam.weights import DEFAULT, list_models, provenance
 
     for name in list_models():  # no table: names and commands are to be copied, whatever the terminal's width
         history = provenance(name)
         config = history["config"]
-        print(name)
+        print(f"{name}  (the default)" if name == DEFAULT else name)
+        print(f"  for {USES.get(name, 'the experiment of the paper')}")
         print(
             f"  {config['features']} features, {history.get('experiment', '')}, {config['iterations']} iterations, "
             f"{history.get('steps', '')} steps, seed {history.get('recipe', {}).get('seed', '')}, "
@@ -22,10 +31,12 @@ def models() -> None:
         print(f"  {history.get('command', '')}")
     print("RMSE and MAE in degrees, network alone; accuracy: share of points whose best match is right.")
     print("All on shapes held out of the training.")
+    print("Names that begin with gnn or fpfh are networks of the paper and need PyTorch: pip install 'idam[torch]'.")
+    print("Give one alone, or after a descriptor, as in practice-any-rotation+gnn-practice.")
 
 
 def as_told(scores: dict[str, float]) -> str:
-    """What a validation found, on a line: the errors of a registration, or how well features match."""
+    """The validation on one line: errors of the registration, or the accuracy of the matches."""
     if "accuracy" in scores:
         return f"accuracy {scores['accuracy']:.3f}, matching loss {scores.get('matching', float('nan')):.3f}"
     return f"RMSE(R) {scores.get('rmse_r', float('nan')):.3f}, MAE(R) {scores.get('mae_r', float('nan')):.3f}"

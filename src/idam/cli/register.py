@@ -21,34 +21,32 @@ STANDARD = Path("-")
 
 def register(
     source: Annotated[Path, typer.Argument(help="The cloud to move.")],
-    target: Annotated[Path, typer.Argument(help="The cloud to lay it on.")],
+    target: Annotated[Path, typer.Argument(help="The cloud that stays.")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write the moved source here, with all that it holds.")
     ] = None,
-    transform: Annotated[Path | None, typer.Option(help="Write the 4x4 here.")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the whole result here.")] = None,
-    html: Annotated[Path | None, typer.Option(help="Write a page to look at the result, opens offline.")] = None,
+    transform: Annotated[Path | None, typer.Option(help="Write the 4x4 matrix here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the whole result here, as JSON.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write a page that shows the result and opens offline.")] = None,
     save_plot: Annotated[
-        Path | None, typer.Option(help="Draw the result as .png or .svg; needs idam[figures].")
+        Path | None, typer.Option(help="Draw the result as .png or .svg; needs idam\\[figures].")
     ] = None,
     model: Annotated[str, typer.Option(help="Name or file of the weights; see 'idam models'.")] = "default",
-    init: Annotated[Path | None, typer.Option(help="File of a 4x4 to start from.")] = None,
-    max_angle: Annotated[float, typer.Option(help="Degrees that it turns at most.")] = 180.0,
+    init: Annotated[Path | None, typer.Option(help="File of a transform as a first guess.")] = None,
+    max_angle: Annotated[float, typer.Option(help="Largest rotation of the answer, in degrees.")] = 180.0,
     voxel_size: Annotated[
-        float | None, typer.Option(help="Resolution for the network; from the data if left out.")
+        float | None, typer.Option(help="Resolution of the matches, in the clouds' unit; from the data if left out.")
     ] = None,
     max_correspondence_distance: Annotated[
         float | None, typer.Option(help="Distance for fitness and RMSE; from the data if left out.")
     ] = None,
     refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point, symmetric or none.")] = "gicp",
     seed: Annotated[int, typer.Option(help="Has no effect: nothing is drawn at random.")] = 0,
-    device: Annotated[str, typer.Option(help="Where the network runs.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Where a network of the paper runs, such as cuda.")] = "cpu",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the 4x4 alone, for scripts.")] = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say on stderr what each step did and took.")
-    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Report each step and its time on stderr.")] = False,
 ) -> None:
-    """Lay SOURCE on TARGET: print the transform and how sure it is.
+    """Register SOURCE to TARGET: print the transform and the probability that it is right.
 
     The files may be PLY, PCD, XYZ, TXT, CSV, PTS, PTX, E57, LAS, LAZ, BIN, NPY, NPZ, OBJ, STL, OFF or GLB, also
     packed as .gz; - is text from the standard input, or to the standard output. The exit code is 0 for a confident
@@ -81,8 +79,8 @@ def register(
     check_outputs(outputs, [path for path in (source, target, init) if path is not None])
     if save_plot is not None:
         check_drawable(save_plot)
-    source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
-    with steps_told(verbose):
+    with steps_told(verbose), faults_named(source, target):
+        source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
         result = registration.register(
             source_cloud,
             target_cloud,
@@ -118,12 +116,25 @@ def register(
 
 
 def check_drawable(path: Path) -> None:
-    """Find out before the work whether a picture can be drawn there."""
+    """Raise before the work starts if a picture cannot be drawn there."""
     from idam.report.view import check_matplotlib
 
     if path.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"{path}: unknown picture format '{path.suffix}': the ones to draw are .png, .svg")
     check_matplotlib("a result")
+
+
+@contextmanager
+def faults_named(source: Path, target: Path) -> Iterator[None]:
+    """Name the file in what is wrong with the source or the target."""
+    try:
+        yield
+    except InputError as error:
+        name, colon, what = str(error).partition(": ")
+        file = {"source": source, "target": target}.get(name)
+        if file is None:
+            raise
+        raise InputError(f"{file}{colon}{what}") from error
 
 
 @contextmanager

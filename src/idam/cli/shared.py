@@ -35,6 +35,6 @@ def show(result: RegistrationResult, quiet: bool = False) -> None:
 
 
 def tell(what: str) -> None:
-    """Say on a terminal's stderr what is being done."""
+    """Report progress on stderr, if that is a terminal."""
     if sys.stderr.isatty():
         print(what, file=sys.stderr)

@@ -15,14 +15,14 @@ __all__ = ["train"]
 
 
 def train(
-    experiment: Annotated[str, typer.Argument(help="For what: a table of 'evaluate', or general.")],
+    experiment: Annotated[str, typer.Argument(help="One of 'idam evaluate', or general.")],
     data: Data,
     features: Annotated[str, typer.Option(help="Point features: gnn, fpfh or invariant.")] = "gnn",
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the weights and the log.")] = None,
-    epochs: Annotated[float, typer.Option(help="Passes over the training pairs; may be a fraction.")] = 40,
+    epochs: Annotated[float, typer.Option(help="Passes over the training pairs, also a fraction.")] = 40,
     batch_size: Annotated[int, typer.Option(help="Pairs a step, over all processes.")] = 16,
     schedule: Annotated[str, typer.Option(help="step (the paper's) or one-cycle.")] = "step",
-    learning_rate: Annotated[float, typer.Option(help="Adam's, at its highest.")] = 1e-4,
+    learning_rate: Annotated[float, typer.Option(help="Highest learning rate of Adam.")] = 1e-4,
     start: Annotated[
         str | None, typer.Option(help="Name or file of a model, or a last.ckpt, whose weights to start from.")
     ] = None,
@@ -31,7 +31,7 @@ def train(
         typer.Option(help="Your own scans for general training, as 'evaluate --pairs' takes them: half of all pairs."),
     ] = None,
     eliminate: Annotated[
-        bool, typer.Option("--eliminate", help="A last stage: train on the points that hard elimination keeps.")
+        bool, typer.Option("--eliminate", help="Last stage: train on the points that hard elimination keeps.")
     ] = False,
     radius: Annotated[float, typer.Option(help="Distance within which points match.")] = 0.05,
     keep: Annotated[float, typer.Option(help="Share of points that balanced sampling draws.")] = 1 / 6,
@@ -40,21 +40,21 @@ def train(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A field of the network's configuration, as iterations=20."),
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the network, such as iterations=20."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the weights, pairs and samples.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of weights, pairs and samples.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     precision: Annotated[str, typer.Option(help="32 or bf16.")] = "32",
     validate_every: Annotated[int, typer.Option(help="Steps between checkpoints.")] = 250,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint.")] = False,
 ) -> None:
-    r"""Train a model; the defaults are the paper's recipe. Under torchrun it uses every process.
+    r"""Train a model; the defaults are the paper's recipe. Runs in many processes under torchrun. Needs idam\[lab].
 
-    General training, on scans as practice has them, teaches features and significance alone: see the last example.
+    General training, on pairs like real scans, teaches features and significance alone: see the last example.
 
-    With --pairs, half of what it learns from are your own scans; --start general goes on from the default model.
+    With --pairs, half of the training pairs are your own scans; --start general continues from the default model.
 
-    Its data may have a folder 'meshes' of .ply meshes besides. Noise, radius and keep play no part in it.
+    Its data may also have a folder 'meshes' of .ply meshes. It ignores --noise, --radius and --keep.
 
     [bold]Examples[/bold]
 

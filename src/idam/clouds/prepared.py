@@ -55,6 +55,10 @@ class Level:
     _surfaces: dict[float, Surface] = field(default_factory=dict, repr=False)
     _spacing: list[float] = field(default_factory=list, repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: small_gicp's surfaces do not, and are made anew there."""
+        return {**self.__dict__, "_surfaces": {}}
+
     @property
     def spacing(self) -> float:
         """The median distance of neighbouring points, in input units."""

@@ -174,7 +174,7 @@ class Pyramid:
             left, ratio = len(thinned.points), other.radius / cloud.radius
             if left < MIN_POINTS and ratio > ODD_SIZES:
                 raise InputError(
-                    f"{other.name}: {ratio:.3g} times the size of {cloud.name}; if their units differ, scale one of "
+                    f"{other.name}: {ratio:.0f} times the size of {cloud.name}; if their units differ, scale one of "
                     "them, or crop the larger cloud to the other's size"
                 )
             if left < MIN_POINTS:

@@ -46,7 +46,8 @@ _POSITIONS = (
     ("position_x", "position_y", "position_z"),
     ("coord_x", "coord_y", "coord_z"),
     ("x_coord", "y_coord", "z_coord"),
-    ("x coordinate", "y coordinate", "z coordinate"),
+    ("x_coordinate", "y_coordinate", "z_coordinate"),
+    ("point_x", "point_y", "point_z"),
 )
 # survey's names: any of the first for x, with any of the second for y, with any of the third for z
 _SURVEY = (
@@ -67,7 +68,7 @@ _NORMALS = (
     ("normals:0", "normals:1", "normals:2"),
     ("normals_0", "normals_1", "normals_2"),
 )
-_UNIT = re.compile(r"\s*[\[({]\s*([^\])}]*?)\s*[\])}]\s*$")
+_UNIT = re.compile(r"\s*[\[({]\s*([^\])}]*?)\s*[\])}]\s*$|(?<=[a-z0-9])(?:_|\s*/\s*)(m|mm|cm|km|ft|in)$", re.IGNORECASE)
 
 # Where a colour or a normal may start in a table without names: x y z and a triple; x y z intensity and a triple (PTS);
 # x y z and two triples. With any other number of columns there is no telling.
@@ -78,8 +79,8 @@ _WINDOWS_NAN = re.compile(rb"[+-]?\d\.[#$]\w*|[+-]?nan\(\w*\)|#(?:N/A|NUM!|DIV/0
 
 
 def plain_name(name: str) -> str:
-    """A column's name in small letters, without its unit: ``x`` for ``X [m]``."""
-    return _UNIT.sub("", name.strip()).strip().casefold()
+    """A column's name in small letters, without its unit and spaces: ``pos_x`` for ``Pos X [m]``."""
+    return "_".join(_UNIT.sub("", name.strip()).split()).casefold()
 
 
 def has_positions(names: Sequence[str]) -> bool:
@@ -129,7 +130,7 @@ def position_names(columns: Sequence[str]) -> Sequence[str]:
             raise InputError("its coordinates are degrees of latitude and longitude: project them to metres first")
         found = ", ".join(columns)[:60] or "none"
         raise InputError(f"has no columns x, y and z (found: {found}): export it with coordinates")
-    units = {match[1].casefold() for name in names if (match := _UNIT.search(name.strip()))}
+    units = {(match[1] or match[2]).casefold() for name in names if (match := _UNIT.search(name.strip()))}
     if len(units) > 1:
         raise InputError(f"its coordinates have different units ({', '.join(sorted(units))}): convert them to one")
     return names

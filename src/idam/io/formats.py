@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import gzip
-import io
 import logging
 import os
 import re
+import textwrap
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,9 @@ log = logging.getLogger("idam.io")
 Placed = tuple[PointCloud, NDArray[np.float64] | None]
 """A scan of a file of several, and its pose."""
 Content = PointCloud | Mesh | list[Placed]
+
+LONGEST = 400
+"""Characters of an error's message: a damaged file may quote thousands."""
 
 _TEXT = (".xyz", ".txt", ".asc", ".csv")
 _DECODERS: dict[str, Callable[[bytes], Content]] = {
@@ -299,12 +303,19 @@ def _is_packed(path: StrPath) -> bool:
 
 
 def _unpacked(data: bytes) -> bytes:
-    stream = gzip.GzipFile(fileobj=io.BytesIO(data))
-    unpacked = stream.read(2**28 + 100 * len(data) + 1)
-    check_unpacked_size(len(unpacked), len(data))
-    if not unpacked:
+    """What gzip packed, in one piece or several."""
+    most, parts = 2**28 + 100 * len(data), []
+    packed = len(data)
+    while data:
+        stream = zlib.decompressobj(wbits=31)
+        parts.append(stream.decompress(data, most + 1))
+        check_unpacked_size(sum(map(len, parts)), packed)
+        if not stream.eof:
+            raise InputError("cut short: its packed data have no end: copy or export it again")
+        data = stream.unused_data
+    if not any(parts):
         raise InputError("is empty once unpacked: copy or export it again")
-    return unpacked
+    return b"".join(parts)
 
 
 @contextlib.contextmanager
@@ -314,7 +325,7 @@ def _faults_of(path: StrPath, suffix: str) -> Iterator[None]:
         with np.errstate(all="ignore"):  # of damaged numbers
             yield
     except InputError as error:
-        message = str(error)
+        message = str(error) if len(str(error)) <= LONGEST else textwrap.shorten(str(error), LONGEST)
         raise error if message.startswith(f"{path}: ") else InputError(f"{path}: {message}") from error
     except MissingDependencyError:
         raise

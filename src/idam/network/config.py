@@ -31,7 +31,7 @@ class Config:
         convolution: score pairs by the similarity matrix convolution; without it, by features' inner products.
         hard_elimination: keep the most significant points; without it, random ones.
         hybrid_elimination: weigh matches by their validity; without it, all alike.
-        matched_by: the model by whose features :func:`idam.register` matches, where this one's turn with the cloud.
+        matched_by: the model by whose features :func:`idam.register` matches, where this one's change with the pose.
     """
 
     features: str = "gnn"

@@ -168,7 +168,7 @@ class IDAM(nn.Module):
     def _again(self, clouds: Clouds, keep: float, best: tuple[Tensor, Tensor] | None) -> Output:
         """Another try, with a share of the points to keep and twice the iterations.
 
-        From the start, or from where the best one so far led: features that turn with the cloud are more alike there.
+        From the start, or from where the best one so far led: features that change with the pose are more alike there.
         """
         source, features = clouds.source, clouds.source_features
         if best is not None:

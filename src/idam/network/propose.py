@@ -13,7 +13,7 @@ __all__ = ["propose"]
 
 @torch.inference_mode()
 def propose(network: IDAM, source: Array, target: Array, guess: Array) -> Array:
-    """The network's transform (4, 4), for a source that the guess's rotation has turned before.
+    """The network's transform (4, 4), for a source that is rotated by the guess first.
 
     Args:
         network: in evaluation mode.

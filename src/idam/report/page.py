@@ -18,15 +18,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.io import PointCloud, write_text
+from idam import rigid
+from idam.clouds.surfaces import nearest_within, spacing_of
+from idam.io import PointCloud, format_transform, write_text
 from idam.report.view import approach, chance, frame, guess_up, sample
 from idam.result import Matches, RegistrationResult
 from idam.search.judge import CONVERGED
 
-__all__ = ["MAX_POINTS", "write_report"]
+__all__ = ["MAX_POINTS", "write_report", "write_view"]
 
 MAX_POINTS = 100_000
 """Points of each cloud a page shows at most."""
+
+TOUCHING = 1.5
+"""Spacings of the target within which a view counts points as touching, as ``register`` does."""
 
 _STEPS = 65535
 """Coordinates are sent as 16-bit integers: steps along the longest side of a cloud's bounding box."""
@@ -83,26 +88,87 @@ def write_report(
     Raises:
         InputError: the file cannot be written.
     """
-    shown = sample(source.points, MAX_POINTS), sample(target.points, MAX_POINTS)
-    template = resources.files("idam.report").joinpath("page.html").read_text(encoding="utf-8")
     level, verdict = _verdict(result.confidence)
-    page = _fill(
-        template,
-        source_name=_escape(source_name),
-        target_name=_escape(target_name),
+    _write(
+        path,
+        (source, target),
+        (source_name, target_name),
+        result.transformation,
+        result.matches,
+        kind="judged",
+        title=_escape(f"{source_name} onto {target_name}: {chance(result.confidence)} confidence"),
+        overline="idam registration report",
         confidence=_escape(chance(result.confidence)),
         confidence_percent=f"{100 * result.confidence:.1f}",
         level=level,
         verdict=verdict,
         reason=_escape(f"{result.reason[:1].upper()}{result.reason[1:]}." if result.reason else ""),
-        headlines=_headlines(result),
-        matrix=_matrix(result.transformation),
-        matrix_text=_escape("\n".join(" ".join(map(repr, row)) for row in result.transformation.tolist())),
-        source_count=_count(shown[0], source.points),
-        target_count=_count(shown[1], target.points),
+        headlines=_headlines(
+            result.transformation, result.fitness, result.inlier_rmse, result.max_correspondence_distance
+        ),
         evidence=_rows(_evidence(result)),
         details=_rows(_details(result, source, target, source_name, target_name)),
-        scene=_json(_scene(*shown, result)),
+    )
+
+
+def write_view(
+    path: str | PathLike[str],
+    source: PointCloud,
+    target: PointCloud,
+    transformation: NDArray[np.float64],
+    *,
+    source_name: str,
+    target_name: str,
+) -> None:
+    """Write a page of two clouds, before and after a transform (4, 4), without a confidence: nothing is known of it.
+
+    The arguments are those of :func:`write_report`. Fitness is measured within one and a half spacings of the target.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    centre = target.points.mean(axis=0)
+    around = target.points - centre
+    distance = TOUCHING * spacing_of(around)
+    rows, apart = nearest_within(rigid.apply(transformation, source.points) - centre, around, distance)
+    rmse = float(np.sqrt(np.mean(apart**2))) if len(apart) else 0.0
+    names = [("Source", source_name, source), ("Target", target_name, target)]
+    _write(
+        path,
+        (source, target),
+        (source_name, target_name),
+        transformation,
+        Matches(np.empty((0, 3)), np.empty((0, 3)), np.empty(0)),
+        kind="unjudged",
+        title=_escape(f"{source_name} and {target_name}"),
+        overline="idam view",
+        **dict.fromkeys(("confidence", "confidence_percent", "level", "verdict", "reason", "evidence"), ""),
+        headlines=_headlines(transformation, len(rows) / len(source.points), rmse, distance),
+        details=_rows([(what, f"{name}, {len(cloud.points):,} points") for what, name, cloud in names]),
+    )
+
+
+def _write(
+    path: str | PathLike[str],
+    clouds: tuple[PointCloud, PointCloud],
+    names: tuple[str, str],
+    transformation: NDArray[np.float64],
+    matches: Matches,
+    **fields: str,
+) -> None:
+    """Fill the template and write it."""
+    shown = [sample(cloud.points, MAX_POINTS) for cloud in clouds]
+    template = resources.files("idam.report").joinpath("page.html").read_text(encoding="utf-8")
+    page = _fill(
+        template,
+        source_name=_escape(names[0]),
+        target_name=_escape(names[1]),
+        matrix=_matrix(transformation),
+        matrix_text=_escape(format_transform(transformation)),
+        source_count=_count(shown[0], clouds[0].points),
+        target_count=_count(shown[1], clouds[1].points),
+        scene=_json(_scene(shown[0], shown[1], transformation, matches)),
+        **fields,
     )
     write_text(path, page)
 
@@ -110,14 +176,13 @@ def write_report(
 # The figures
 
 
-def _headlines(result: RegistrationResult) -> str:
+def _headlines(transformation: NDArray[np.float64], fitness: float, rmse: float, distance: float) -> str:
     """Lay out the four figures at the top as cards."""
-    shift = float(np.linalg.norm(result.transformation[:3, 3]))
-    distance = _number(result.max_correspondence_distance, 3)
+    shift = float(np.linalg.norm(transformation[:3, 3]))
     cards = [
-        ("Fitness", f"{100 * result.fitness:.1f} %", f"of the source lies within {distance} of the target"),
-        ("Inlier RMSE", _number(result.inlier_rmse, 3), "distance of those points, in the input’s unit"),
-        ("Rotation", _degrees(result.transformation[:3, :3]), "angle, about one axis"),
+        ("Fitness", f"{100 * fitness:.1f} %", f"of the source lies within {_number(distance, 3)} of the target"),
+        ("Inlier RMSE", _number(rmse, 3), "distance of those points, in the input’s unit"),
+        ("Rotation", _degrees(transformation[:3, :3]), "angle, about one axis"),
         ("Translation", _number(shift), "length, in the input’s unit"),
     ]
     return "\n".join(
@@ -198,7 +263,9 @@ def _number(value: float, digits: int = 4) -> str:
 # The scene
 
 
-def _scene(source: NDArray[np.float64], target: NDArray[np.float64], result: RegistrationResult) -> dict[str, Any]:
+def _scene(
+    source: NDArray[np.float64], target: NDArray[np.float64], transformation: NDArray[np.float64], matches: Matches
+) -> dict[str, Any]:
     """Gather what the page's script draws, in coordinates around the target's centre.
 
     A cloud's own coordinates are relative to its centre, so that float32 is enough for what was in metres of a
@@ -207,13 +274,13 @@ def _scene(source: NDArray[np.float64], target: NDArray[np.float64], result: Reg
     clouds = [_cloud(source), _cloud(target)]
     centres = [np.array(cloud["centre"]) for cloud in clouds]
     local = [points - centre for points, centre in zip((source, target), centres, strict=True)]
-    rotation = result.transformation[:3, :3]
-    moved = result.apply(centres[0]) - centres[1]
+    rotation = transformation[:3, :3]
+    moved = rotation @ centres[0] + transformation[:3, 3] - centres[1]
     offset, gap = approach(local, centres[0] - centres[1])
     return {
         "source": clouds[0],
         "target": clouds[1],
-        "matches": _matches(result.matches, centres),
+        "matches": _matches(matches, centres),
         "before": {
             "pose": _pose(np.eye(3), offset),
             "gap": _number(gap) if gap else "",

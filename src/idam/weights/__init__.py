@@ -93,12 +93,12 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 
 def is_descriptor(name: str | os.PathLike[str]) -> bool:
-    """Whether a model's features are those that no pose changes; raise InputError where it is not a model."""
+    """Whether a model's features do not change with the pose; raise InputError where it is not a model."""
     return bool(provenance(name)["config"].get("features") == "invariant")
 
 
 def load_descriptor(name: str | os.PathLike[str] = "default") -> Descriptor:
-    """The descriptor of a model whose features no pose changes; read again where the file has changed.
+    """The descriptor of a model whose features do not change with the pose; read again where the file has changed.
 
     Raises:
         InputError: there is no such model, the file is not a model, or its features change with the pose.
@@ -117,7 +117,7 @@ def _descriptor(path: Path, modified: int, size: int) -> Descriptor:
             return Descriptor({key.removeprefix(prefix): x for key, x in weights.items() if key.startswith(prefix)})
     except UNREADABLE as error:
         raise not_a_model(path, error) from None
-    raise InputError(f"{path}: its features turn with the cloud; name a model such as {DEFAULT}")
+    raise InputError(f"{path}: its features change with the pose; name a model such as {DEFAULT}")
 
 
 def not_a_model(path: Path, error: BaseException) -> InputError:

@@ -26,7 +26,7 @@ from idam.lab.data.own_pairs import OwnPair
 from idam.lab.data.surfaces import random_blob
 from idam.lab.data.working import TOUCHING, ScanPair
 
-KINDS = ["_halves", "_views_of_a_thing", "_views_of_a_room", "_views_of_a_street"]
+KINDS = ["_halves", "_views_of_an_object", "_views_of_a_room", "_views_of_a_street"]
 kinds = pytest.mark.parametrize("kind", KINDS)
 
 
@@ -278,5 +278,5 @@ def test_a_mesh_that_cannot_be_used_is_refused_in_one_line(spoil, tmp_path):
 def test_a_mesh_is_sampled(scans, material):
     # with meshes, some of the things are others than without
     without = Material(material.shapes)
-    pairs = zip(scans("_views_of_a_thing", 3), scans("_views_of_a_thing", 3, without), strict=True)
+    pairs = zip(scans("_views_of_an_object", 3), scans("_views_of_an_object", 3, without), strict=True)
     assert any(not np.array_equal(one[0], other[0]) for one, other in pairs)

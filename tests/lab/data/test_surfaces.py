@@ -13,16 +13,16 @@ from idam.lab.data.surfaces import (
     box,
     cylinder,
     random_blob,
+    random_object,
     random_room,
     random_street,
-    random_thing,
     stand,
     unit,
     warp,
 )
 
 SURFACES: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
-    "thing": lambda rng: random_thing(500, rng),
+    "thing": lambda rng: random_object(500, rng),
     "blob": lambda rng: random_blob(500, rng),
     "room": lambda rng: random_room(500, rng)[0],
     "street": lambda rng: random_street(500, rng)[0],
@@ -55,7 +55,7 @@ def test_a_surface_depends_on_the_generator_alone(name):
 def test_a_thing_of_any_kind_is_centred_and_as_large_as_the_unit_sphere(of_meshes, of_parts, meshes, rng, monkeypatch):
     monkeypatch.setattr(surfaces, "MESHES", of_meshes)
     monkeypatch.setattr(surfaces, "PARTS", of_parts)
-    things = [random_thing(2000, rng, meshes) for _ in range(5)]
+    things = [random_object(2000, rng, meshes) for _ in range(5)]
     for points in things:
         assert points.shape == (2000, 3)
         np.testing.assert_allclose(points.mean(0), 0, atol=1e-12)
@@ -71,7 +71,7 @@ def test_meshes_are_taken_for_about_half_of_the_things(meshes, rng, monkeypatch)
         surfaces, "sample_surface", lambda mesh, count, rng: (sampled.append(mesh), rng.normal(size=(count, 3)))[1]
     )
     for _ in range(60):
-        random_thing(10, rng, meshes)
+        random_object(10, rng, meshes)
     assert 18 <= sum(mesh is meshes[0] for mesh in sampled) <= 42
 
 
@@ -149,7 +149,7 @@ def test_a_room_has_a_floor_and_walls_but_no_ceiling_and_is_looked_at_from_withi
 
 def test_meshes_furnish_rooms(meshes, monkeypatch):
     asked = []
-    monkeypatch.setattr(surfaces, "random_thing", lambda count, rng, meshes: (asked.append(meshes), np.eye(3))[1])
+    monkeypatch.setattr(surfaces, "random_object", lambda count, rng, meshes: (asked.append(meshes), np.eye(3))[1])
     for seed in range(5):
         random_room(2000, np.random.default_rng(seed), meshes)
     assert asked

@@ -90,7 +90,7 @@ def _check_request(url: str, sha256: str | None) -> None:
     """Refuse at once what would fail later, perhaps after the download.
 
     Raises:
-        InputError: the URL or the checksum is none.
+        InputError: the URL or the checksum is malformed.
         MissingDependencyError: h5py is not installed.
     """
     import_h5py()

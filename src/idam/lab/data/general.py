@@ -1,6 +1,6 @@
 """Pairs of scans as practice has them: any rotation, other points, partial views, noise, strays; drawn without end.
 
-Where the paper's protocol crops two copies of the same points, here each scan samples the surface anew: a thing seen
+Where the paper's protocol crops two copies of the same points, here each scan samples the surface anew: an object seen
 from a few viewpoints, a room, a street as a spinning LiDAR sees it, or half of a ModelNet40 shape's points; and half of
 the pairs are ray-cast (:mod:`idam.lab.data.sensor_pairs`), with the sensors' own patterns in them. All go through the
 same centring, scaling and voxel grid as in :func:`idam.register`, so that a network sees in training what it sees in
@@ -26,7 +26,7 @@ from idam.io.files import one_line, silenced
 from idam.lab.data.own_pairs import OwnPair
 from idam.lab.data.practice import make_practice_pairs
 from idam.lab.data.sensor_pairs import draw_part_in_whole, draw_sensor_pair
-from idam.lab.data.surfaces import random_room, random_street, random_thing
+from idam.lab.data.surfaces import random_object, random_room, random_street
 from idam.lab.data.visibility import seen_from_afar, seen_from_within
 from idam.lab.data.working import ScanPair, as_registered
 
@@ -36,13 +36,13 @@ Points = NDArray[np.float64]
 Draw = Callable[["Material", np.random.Generator], "tuple[Points, Points] | None"]
 
 DENSE = 60_000
-"""Points of a thing before it is scanned; rooms and streets have twice as many."""
+"""Points of an object before it is scanned; rooms and streets have twice as many."""
 FEWEST = 120
 """Points of each scan at least."""
 COUNTS, SHARES = (600, 1000, 1500, 2000), (0.1, 0.25, 0.35, 0.3)
 """Points of the larger scan, about, and how often each number is drawn."""
 NOISE, MUCH_NOISE = 0.008, 0.02
-"""Largest sigmas, in a thing's radii, of most pairs and of every fifth."""
+"""Largest sigmas, in an object's radii, of most pairs and of every fifth."""
 STRAYS = 0.006
 """Largest share of points that are strays, in every third scan."""
 LEAST_OVERLAP, MORE_OVERLAP = 0.05, 0.2
@@ -108,7 +108,7 @@ def draw_scans(material: Material, rng: np.random.Generator) -> ScanPair:
 
 
 def _as_sensed(material: Material, rng: np.random.Generator) -> ScanPair | None:
-    """A pair with the patterns of real sensors in it, turned in any way; None where too few points are left."""
+    """A pair with the patterns of real sensors in it, in any rotation; None where too few points are left."""
     inside = rng.random() < IN_WHOLE
     pair = draw_part_in_whole(rng, material.meshes) if inside else draw_sensor_pair(rng)
     turned = rigid.transform(Rotation.random(random_state=rng).as_matrix(), np.zeros(3))
@@ -119,7 +119,7 @@ def _as_sensed(material: Material, rng: np.random.Generator) -> ScanPair | None:
 
 def _of_dense_points(material: Material, rng: np.random.Generator) -> ScanPair | None:
     """A pair that samples a surface of dense points evenly; None where there is too little of it."""
-    kinds: list[Draw] = [_halves, _views_of_a_thing, _views_of_a_room, _views_of_a_street]
+    kinds: list[Draw] = [_halves, _views_of_an_object, _views_of_a_room, _views_of_a_street]
     drawn = kinds[rng.choice(len(kinds), p=(0.2, 0.45, 0.2, 0.15))](material, rng)
     return None if drawn is None else _as_scanned(*drawn, rng)
 
@@ -157,9 +157,9 @@ def _halves(material: Material, rng: np.random.Generator) -> tuple[Points, Point
     return first[_below(first, 0.55, rng)], second[_below(second, 0.55, rng)]
 
 
-def _views_of_a_thing(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
-    """A thing from all around, or as one or three viewpoints see it, those of the two scans 10 to 130 degrees apart."""
-    points = random_thing(DENSE, rng, material.meshes) @ Rotation.random(random_state=rng).as_matrix().T
+def _views_of_an_object(material: Material, rng: np.random.Generator) -> tuple[Points, Points] | None:
+    """An object from all around, or seen from one or three viewpoints, those of the scans 10 to 130 degrees apart."""
+    points = random_object(DENSE, rng, material.meshes) @ Rotation.random(random_state=rng).as_matrix().T
     axis = rng.normal(size=3)
     apart = np.radians(rng.uniform(10, 130)) * axis / np.linalg.norm(axis)
     first = Rotation.random(random_state=rng)

@@ -22,7 +22,7 @@ def post(scene: Scene, rng: np.random.Generator, x: float, y: float, label: int)
 
 
 def crate(scene: Scene, rng: np.random.Generator, x: float, y: float, label: int) -> None:
-    """A box that stands on the ground, turned in some way."""
+    """A box that stands on the ground, at any heading."""
     size = rng.uniform(0.3, 1.6, 3)
     scene.add("box", (x, y, size[2] / 2), size, yawed(rng.uniform(0, np.pi)), label)
 

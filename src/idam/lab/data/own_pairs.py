@@ -195,7 +195,7 @@ def _check_shape(path: Path, name: str, array: NDArray[Any], shape: tuple[int, .
 
 
 def _check_finite(path: Path, name: str, array: NDArray[Any]) -> None:
-    """Raise InputError where numbers are none, or such as float32 does not have."""
+    """Raise InputError where numbers are NaN, infinite, or too large for float32."""
     if not np.abs(array).max() < np.finfo(np.float32).max:
         raise InputError(f"{path}: {name} holds NaN or infinite numbers")
 

@@ -54,7 +54,7 @@ def sample_surface(mesh: Any, count: int, rng: np.random.Generator) -> Points:
 
 @dataclass(frozen=True)
 class View:
-    """Two views of one thing: source (N, 3), target (P, 3), and the truth (4, 4), target = T source."""
+    """Two views of one object: source (N, 3), target (P, 3), and the truth (4, 4), target = T source."""
 
     source: Points
     target: Points

@@ -57,12 +57,12 @@ def make_practice_pairs(points: Tensor, generator: torch.Generator, max_angle: f
 
 
 def in_any_pose(points: Tensor, generator: torch.Generator) -> Tensor:
-    """The shapes (B, N, 3), each turned in some way: in practice there is no common upright."""
+    """The shapes (B, N, 3), each in a random rotation: in practice there is no common upright."""
     return points @ random_rotation(len(points), generator=generator).transpose(-1, -2)
 
 
 def fixed_practice_pairs(points: Tensor, seed: int, *, any_rotation: bool) -> Pairs:
-    """Test pairs from whole shapes (B, N, 3), turned little or in any way: each depends on the seed and its index."""
+    """Test pairs from whole shapes (B, N, 3), with small rotations or any: each depends on the seed and its index."""
     drawn = drawn_singly(lambda generator: _draw(1, points.shape[1], generator), len(points), seed)
     rotation = quaternion_to_rotation(drawn.quaternion) if any_rotation else euler_xyz_to_rotation(drawn.angles)
     return _build(points, drawn, rotation)

@@ -1,4 +1,4 @@
-"""Surfaces of our own making, as dense points: single things, rooms, streets; each drawn from a generator."""
+"""Surfaces of our own making, as dense points: single objects, rooms, streets; each drawn from a generator."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from scipy.spatial.transform import Rotation
 
 from idam.lab.data.parts import random_part, sample_surface
 
-__all__ = ["random_blob", "random_room", "random_street", "random_thing"]
+__all__ = ["random_blob", "random_object", "random_room", "random_street"]
 
 Points = NDArray[np.float64]
 
 MESHES, PARTS = 0.5, 0.25
-"""Shares of things that are warped meshes, where there are any, and parts; the others are blobs."""
+"""Shares of objects that are warped meshes, where there are any, and parts; the others are blobs."""
 CORE = 0.98
-"""Share of a thing's points that lie in the unit sphere."""
+"""Share of an object's points that lie in the unit sphere."""
 PLACES = 8
 """Viewpoints that come with a room or a street."""
 
 
-def random_thing(count: int, rng: np.random.Generator, meshes: Sequence[Any] = ()) -> Points:
-    """A single thing (count, 3), about as large as the unit sphere: a warped mesh, a mechanical part or a blob.
+def random_object(count: int, rng: np.random.Generator, meshes: Sequence[Any] = ()) -> Points:
+    """A single object (count, 3), about as large as the unit sphere: a warped mesh, a mechanical part or a blob.
 
     Args:
         count: of points.
@@ -49,7 +49,7 @@ def unit(points: Points) -> Points:
 
 
 def warp(points: Points, rng: np.random.Generator) -> Points:
-    """Points (N, 3) bent by waves about as long as the thing, and stretched: a mesh becomes many shapes."""
+    """Points (N, 3) bent by waves about as long as the object, and stretched: a mesh becomes many shapes."""
     bent = points.copy()
     for _ in range(3):
         wave = rng.normal(size=3) * rng.uniform(0.8, 2.5)
@@ -117,7 +117,7 @@ def _furniture(count: int, rng: np.random.Generator, meshes: Sequence[Any]) -> P
         return box(count, rng.uniform(0.08, 0.5, 3), rng)
     if kind < 0.6:
         return cylinder(count, rng.uniform(0.03, 0.12), rng.uniform(0.1, 0.6), rng)
-    return random_thing(count, rng, meshes) * rng.uniform(0.08, 0.3)
+    return random_object(count, rng, meshes) * rng.uniform(0.08, 0.3)
 
 
 def random_street(count: int, rng: np.random.Generator) -> tuple[Points, Points]:

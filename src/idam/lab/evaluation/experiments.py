@@ -100,7 +100,7 @@ def read_pairs(path: str | Path, within: tuple[float, float] | None = None) -> T
         within: degrees and distance up to which an answer counts as right; None for the file's, or 5 and 0.05.
 
     Raises:
-        InputError: the file is missing or not of its form, or the bounds are none.
+        InputError: the file is missing or not of its form, or the bounds are not positive numbers.
     """
     if within is not None and not (within[0] > 0 and within[1] > 0):
         raise InputError(f"cannot count answers within {within[0]:g} degrees and {within[1]:g}: both must be positive")

@@ -52,7 +52,7 @@ class Metrics:
 def motion_error(
     found: NDArray[np.float64], truth: NDArray[np.float64], centre: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Degrees between two transforms (4, 4), and how far apart they lay the source's centre (3,)."""
+    """Degrees between two transforms (4, 4), and the distance between where they move the source's centre (3,)."""
     degrees = np.degrees(Rotation.from_matrix(found[:3, :3].T @ truth[:3, :3]).magnitude())
     apart = (found - truth) @ [*centre, 1.0]
     return float(degrees), float(np.linalg.norm(apart))

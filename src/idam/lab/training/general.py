@@ -216,7 +216,7 @@ class GeneralTask:
 
 
 def learns_features_alone(recipe: Recipe) -> bool:
-    """Whether a recipe is for this training: scans in any pose, and features that no pose changes."""
+    """Whether a recipe is for this training: scans in any pose, and features that do not change with it."""
     halves = recipe.experiment == "practice-any-rotation" and recipe.config.features == "invariant"
     return recipe.experiment == "general" or halves
 
@@ -224,7 +224,9 @@ def learns_features_alone(recipe: Recipe) -> bool:
 def check_general(recipe: Recipe, precision: str) -> None:
     """Raise InputError where a recipe asks for what this training does not teach."""
     if recipe.config.features != "invariant":
-        raise InputError("training for practice needs features that no pose changes: choose --features invariant")
+        raise InputError(
+            "training for practice needs features that do not change with the pose: choose --features invariant"
+        )
     if recipe.config.convolution or recipe.config.hybrid_elimination:
         raise InputError(
             "training for practice teaches no convolution and no validity: "

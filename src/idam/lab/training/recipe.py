@@ -63,7 +63,7 @@ class Recipe:
 
     @property
     def max_angle(self) -> float:
-        """Largest angle of pairs turned in any way: only GNN features can tell, and they get a near start in use."""
+        """Largest angle, in radians, of pairs in any rotation; less for GNN features, which are given a near start."""
         return math.radians(75) if self.config.features == "gnn" else math.pi
 
     def rate(self, progress: float) -> float:

@@ -1,4 +1,4 @@
-"""The learned features that no pose changes (:mod:`idam.describe.invariant`), to train.
+"""The learned features that do not change with the pose (:mod:`idam.describe.invariant`), to train.
 
 What does not depend on weights, the surroundings and the pair features, is NumPy's; the layers are here once more, as
 a module with gradients.

@@ -13,7 +13,7 @@ from idam.errors import InputError
 __all__ = ["ABLATION", "METHODS", "Method", "build_method", "has_weights", "rows_of"]
 
 Method = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float64]]
-"""Source (P, 3) and target (Q, 3) to the transform (4, 4) that lays the source on the target."""
+"""Source (P, 3) and target (Q, 3) to the transform (4, 4) that moves the source onto the target."""
 
 PAPER = ("iterations=3", f"keep={1 / 6}", "keep_again=", "keep_matches=0.5", "soft_matches=false")
 """The paper's inference, whatever a model's own."""

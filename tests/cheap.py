@@ -45,6 +45,20 @@ class Cheap:
         return {name: known.get(name) for name in COLUMNS}
 
 
+class Named(Cheap):
+    """Cheap work on the file name of the source."""
+
+    def __call__(self, pair: Pair) -> Row:
+        return super().__call__(Pair(pair.id, Path(pair.source).name, "t", folder=str(Path(pair.source).parent)))
+
+
+class Threads(Cheap):
+    """Rows that say how many threads libraries may start."""
+
+    def __call__(self, pair: Pair) -> Row:
+        return super().__call__(pair) | {"reason": os.environ.get("OMP_NUM_THREADS")}
+
+
 def settled(rows: list[Row]) -> dict[str, Row]:
     """Rows by id, without what differs from run to run; no id may be there twice."""
     by_id = {row["id"]: row | {"seconds": None} for row in rows}

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from cheap import ENVIRONMENT
 
 processes = pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to see the processes of a batch")

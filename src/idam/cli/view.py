@@ -1,0 +1,41 @@
+"""``idam view``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["view"]
+
+
+def view(
+    source: Annotated[Path, typer.Argument(help="The cloud to move.")],
+    target: Annotated[Path, typer.Argument(help="The cloud to look at it with.")],
+    transform: Annotated[
+        Path | None, typer.Argument(help="File of the transform to move it by; none if left out.")
+    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Write the page here.")] = Path("view.html"),
+    no_open: Annotated[bool, typer.Option("--no-open", help="Only write the page.")] = False,
+) -> None:
+    """Write a page with SOURCE and TARGET before and after a transform, and open it in the browser.
+
+    [bold]Examples[/bold]
+
+      idam view scan1.ply scan2.ply
+
+      idam view scan1.ply scan2.ply T.txt -o look.html --no-open
+    """
+    import numpy as np
+
+    from idam.io import check_outputs, read_point_cloud, read_transform
+    from idam.report.page import write_view
+
+    check_outputs([output], [path for path in (source, target, transform) if path is not None])
+    matrix = np.eye(4) if transform is None else read_transform(transform)
+    clouds = read_point_cloud(source), read_point_cloud(target)
+    write_view(output, *clouds, matrix, source_name=source.name, target_name=target.name)
+    print(f"look at {output}")
+    if not no_open:
+        typer.launch(str(output.resolve()))
