@@ -153,4 +153,4 @@ def test_what_hangs_on_one_link_is_the_smaller_side_whatever_the_reference() -> 
     trust = weigh(poses, links, np.ones(len(links), bool), list("abcde"), 0.9, first=4)
     assert trust.components == [[4, 0, 1, 2, 3]]
     assert [bool(reason) for reason in trust.reason] == [False] * 4 + [True]
-    assert trust.confidence[:4] == pytest.approx(0.98)
+    assert trust.confidence[:4] == pytest.approx(0.98, abs=0.01)
