@@ -247,6 +247,15 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert files_in(work / "out") == set() if (work / "out").exists() else True
 
 
+@pytest.mark.parametrize("given", ["scans", "scans/view0.ply"])
+def test_the_model_never_lies_among_the_scans(work: Path, call: Call, calls: list[Any], given: str) -> None:
+    before = files_in(work)
+    run = call(given, "scans/view1.ply", "-o", "scans/../scans")
+    assert run.code == 2
+    assert "folder of its own" in run.err
+    assert files_in(work) == before
+
+
 def test_the_merged_cloud_has_each_place_once(work: Path, call: Call, calls: list[Any]) -> None:
     call("scans", "-o", "out")
     merged = read_point_cloud(work / "out" / "merged.ply")

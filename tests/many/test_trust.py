@@ -144,3 +144,13 @@ def test_the_first_scan_of_a_component_is_the_reference() -> None:
     trust = weigh(poses, graph.links, agrees, list("abcdefghij"), 0.9, first=7)
     assert trust.components[0][0] == 7
     assert trust.confidence[7] == 1
+
+
+def test_what_hangs_on_one_link_is_the_smaller_side_whatever_the_reference() -> None:
+    poses = rigid.exp(RANDOM.normal(size=(5, 6)))
+    entries = [(s, t, rigid.inverse(poses[t]) @ poses[s], 0.98) for s, t in [*combinations(range(4), 2), (3, 4)]]
+    links = links_of(entries)
+    trust = weigh(poses, links, np.ones(len(links), bool), list("abcde"), 0.9, first=4)
+    assert trust.components == [[4, 0, 1, 2, 3]]
+    assert [bool(reason) for reason in trust.reason] == [False] * 4 + [True]
+    assert trust.confidence[:4] == pytest.approx(0.98, abs=0.01)

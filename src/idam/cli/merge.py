@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from idam.cli.shared import UNSURE
+from idam.errors import InputError
 
 if TYPE_CHECKING:
     from idam.many.result import MergeResult
@@ -55,6 +56,7 @@ def merge(
     from idam.many.merge import merge as run
     from idam.report.merge import write_merge_report
 
+    check_apart(scans, output)
     starting = None if poses is None else read_poses(poses)
     make_folder(output)
     check_writable(output / "merged.ply")
@@ -77,6 +79,16 @@ def merge(
         show(result, output)
     if not result.complete:
         raise typer.Exit(UNSURE)
+
+
+def check_apart(scans: list[Path], output: Path) -> None:
+    """Raise InputError where the model would lie among the scans: run again, it would be taken for one."""
+    for scan in scans:
+        folder = scan if scan.is_dir() else scan.parent
+        if folder.resolve() == output.resolve():
+            raise InputError(
+                f"{output}: holds scans to merge: write to a folder of its own, such as {output / 'merged'}"
+            )
 
 
 def cores() -> int:

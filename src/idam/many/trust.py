@@ -104,7 +104,8 @@ def weigh(
         for cut in holding:
             beyond = [scan for scan in component if cut.side[scan] != cut.side[component[0]]]
             confidence[beyond] *= cut.probability
-            for scan in beyond if cut.across == 1 else []:
+            fewer = beyond if 2 * len(beyond) <= len(component) else sorted(set(component) - set(beyond))
+            for scan in fewer if cut.across == 1 else []:
                 reason[scan] = reason[scan] or f"hangs on one link, {_told(cut.link, links, names)}: nothing checks it"
     for component in components[1:]:
         for scan in component if len(component) > 1 else []:
