@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import idam
+from answers import EVIDENCE, STRENGTH, made_up
 from idam import RegistrationResult
 from idam.errors import InputError
 from idam.io import read_transform
 from idam.result import Hypothesis, Matches
 from motions import rigid
-from results import EVIDENCE, STRENGTH, made_up
 from solids import distances
 
 SOURCE = np.random.default_rng(0).normal(size=(50, 3))

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from answers import EVIDENCE, made_up
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.report.page import MAX_POINTS, RUNNERS_UP, write_report
 from idam.result import Hypothesis, Matches, RegistrationResult
-from results import EVIDENCE, made_up
 
 HERE = (0.0, 0.0, 0.0)
 NATIONAL_GRID = (512_300.0, 5_403_200.0, 320.0)

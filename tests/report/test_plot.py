@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from answers import made_up
 from idam.errors import InputError
 from idam.io import PointCloud
 from idam.result import Matches, RegistrationResult
-from results import made_up
 
 matplotlib = pytest.importorskip("matplotlib", reason="figures need Matplotlib: pip install 'idam[figures]'")
 

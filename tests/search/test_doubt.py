@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from answers import EVIDENCE
 from idam.search.doubt import SLIGHT, STRAIGHT, THROUGH, TIED, doubt
 from idam.search.judge import Evidence
 from motions import rigid
-from results import EVIDENCE
 
 CENTRE = np.array([3.0, -1.0, 0.5])
 POSE = rigid([0.4, -1.0, 0.3], [10.0, 0.0, -2.0])
