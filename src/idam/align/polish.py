@@ -14,7 +14,7 @@ from idam.rigid import Array
 
 __all__ = ["finished", "polish"]
 
-ITERATIONS = 6
+ITERATIONS = 3
 """At most."""
 STILL = 5e-6
 """Length of a step, in radians and working units, from which on it is done."""

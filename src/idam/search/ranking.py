@@ -24,7 +24,7 @@ SAME_SHIFT = 0.1
 """Distance within which two answers must lay the source's centre to count as one, in working units."""
 ITERATIONS = 12
 """Of the refinement before an answer is scored: right ones have come near by then, wrong ones may never."""
-STEPS = 6
+STEPS = 4
 """Of the refinement on the fine clouds, where an answer comes from the coarser ones; the last one has more."""
 UNLIKELY = 0.05
 """Overlap counts for so much where the features do not speak for an answer: on flat ground they say nothing."""
