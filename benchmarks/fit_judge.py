@@ -3,6 +3,8 @@
     python benchmarks/fit_judge.py collect FILE [--pairs 400] [--seed 0] [--data MODELNET40]
     python benchmarks/fit_judge.py fit FILE... [--json docs/results/confidence.json] [--write]
 
+The shipped fit is of ``collect seed-1.jsonl --pairs 420 --seed 1`` and the same with 2, both with --data.
+
 Pairs are of the sensors' families (:mod:`idam.lab.data.sensor_pairs`), scans as the general model learnt from, though
 not those, views of random parts (300 to 8000 points sampled independently, noise to 2 %), shapes with no one right
 answer (sphere, cylinder, plane, box), two different parts, and, with --data, disjoint halves of ModelNet40's shapes.
@@ -190,8 +192,8 @@ def summaries(records: list[dict[str, Any]], weights: Array) -> tuple[Array, Arr
         known = np.array(record["features"])
         z = known @ weights
         best = int(z.argmax())
-        others = np.delete(z, best)
-        said.append([*known[best], min(z[best] - others.max(), LEAD) if len(others) else LEAD])
+        nothing = 0.0  # the weight of an answer that lays nothing on anything
+        said.append([*known[best], min(z[best] - np.delete(z, best).max(initial=nothing), LEAD)])
         right.append(record["right"][best])
     return np.array(said), np.array(right, float)
 
@@ -247,7 +249,8 @@ def main() -> None:
     table = dict(left_out(records))
     for family, row in table.items():
         print(f"{family:<12}", " ".join(f"{name} {value:.3g}" for name, value in row.items()))
-    held = {"about": f"benchmarks/fit_judge.py fit, {len(records)} pairs", **fit(records)}
+    files = " ".join(file.name for file in arguments.files)
+    held = {"about": f"benchmarks/fit_judge.py fit {files}, {len(records)} pairs", **fit(records)}
     print(json.dumps(held, indent=1))
     if arguments.json is not None:
         arguments.json.write_text(json.dumps({**held, "left out": table}, indent=1) + "\n")

@@ -187,17 +187,30 @@ def scale(sizes: list[dict[str, float]]) -> str:
 
 
 def confidences(record: dict[str, Any]) -> str:
-    """What the confidence was fitted to, and how well."""
-    return "\n".join(
-        [
-            "## Confidence",
-            "",
-            "![Reliability, and risk against coverage](images/confidence.png)",
-            "",
-            f"- `python {record['about']}`: calibration error {record['calibration_error']:.3f} on the "
-            f"{len(record['pairs']) // 2} pairs held back.",
-        ]
+    """What the confidence was fitted to, and how well it holds of families that it was not fitted to."""
+    about = (
+        f"- `{record['about']}`. Each family's line is of a fit to all the others. `found` counts pairs with a right "
+        "answer among those that were found; `sure` is a confidence of 0.9 or more."
     )
+    return "\n".join(["## Confidence, each family left out of the fit", "", families(record["left out"]), "", about])
+
+
+def trust(record: dict[str, Any]) -> str:
+    """How often register is right, sure, and sure and wrong, by family."""
+    about = (
+        f"- `benchmarks/trust.py FOLDER... --pairs {record['pairs']} --seed {record['seed']}`: "
+        f"{record['date'][:10]}, {record['processor']}. `known` counts pairs whose place something in the scene fixes; "
+        "a sure answer to one of the others counts as wrong."
+    )
+    return "\n".join(["## Trust", "", families(record["families"]), "", about])
+
+
+def families(rows: dict[str, dict[str, float]]) -> str:
+    """A table with a line a family."""
+    columns = list(next(iter(rows.values())))
+    lines = [line(["family", *columns]), line(["---"] * (len(columns) + 1))]
+    lines += [line([name, *(f"{row[column]:.3g}" for column in columns)]) for name, row in rows.items()]
+    return "\n".join(lines)
 
 
 def line(cells: list[str]) -> str:
@@ -219,8 +232,9 @@ def main() -> None:
     sections += [table(group) for name, group in tables.items() if name.startswith("practice")]
     sections += [efficiency(record) for record in records if "median_ms" in record]
     sections += [scale(content) for content in files if isinstance(content, list)]
-    sections += [real_scans(record) for record in records if "records" in record]
-    sections += [confidences(record) for record in records if "calibration_error" in record]
+    sections += [real_scans(record) for record in records if "records" in record and "families" not in record]
+    sections += [trust(record) for record in records if "families" in record]
+    sections += [confidences(record) for record in records if "left out" in record]
     print("\n\n".join(sections))
 
 
