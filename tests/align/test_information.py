@@ -10,7 +10,6 @@ from idam.align import align, reaches
 from idam.align.information import information
 from idam.align.patches import Dense, Pairs
 from idam.align.polish import finished, polish
-from idam.align.scale import scale_residual
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.rigid import Array
 
@@ -113,15 +112,3 @@ def test_without_overlap_there_is_none() -> None:
 def test_information_turns_with_the_clouds_and_grows_with_the_points() -> None:
     few, many = (np.linalg.eigvalsh(information(aligned(scanned(blob, 0, n, 0.003), 0)[1])).min() for n in (1000, 8000))
     assert many > 3 * few
-
-
-@pytest.mark.parametrize("scale", [1.0, 1.02, 0.98])
-def test_scale_is_found(scale: float) -> None:
-    surfaces = scanned(blob, 3, 6000, 0.002)
-    target = surfaces_of(surfaces.source.points, scale * surfaces.target.points)
-    start = TRUTH.copy()
-    start[:3, 3] *= scale
-    found, error = scale_residual(target, start)
-    assert abs(found - scale) < max(4 * error, 0.002)
-    assert error < 0.003
-    assert (abs(found - 1) > 5 * error) == (scale != 1.0)

@@ -25,8 +25,8 @@ from idam.search.stages import (
     explain,
     first_of_its_kind,
     judged,
-    least_turned,
     search,
+    smallest_rotation,
 )
 from idam.weights import load_descriptor
 from matchings import level, matching_by, scores_for
@@ -244,10 +244,10 @@ def test_of_answers_as_good_as_the_best_the_one_nearest_to_the_guess_comes_first
     best = Answer(about_z(180), overlap=0.9, likelihood=1.0)
     turn, slight = behind(best, 0.4 * TIED, 90), behind(best, 0.9 * TIED, 20)
     worse = behind(best, 1.1 * TIED, 0)
-    assert least_turned([best, turn, slight, worse], np.eye(4)) == [slight, best, turn, worse]
-    assert least_turned([best, turn, slight, worse], about_z(100)) == [turn, best, slight, worse]
-    assert least_turned([best], np.eye(4)) == [best]
-    assert least_turned([best, worse], np.eye(4)) == [best, worse]
+    assert smallest_rotation([best, turn, slight, worse], np.eye(4)) == [slight, best, turn, worse]
+    assert smallest_rotation([best, turn, slight, worse], about_z(100)) == [turn, best, slight, worse]
+    assert smallest_rotation([best], np.eye(4)) == [best]
+    assert smallest_rotation([best, worse], np.eye(4)) == [best, worse]
 
 
 def test_of_answers_that_are_alike_the_first_stays() -> None:

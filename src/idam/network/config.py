@@ -31,7 +31,6 @@ class Config:
         convolution: score pairs by the similarity matrix convolution; without it, by features' inner products.
         hard_elimination: keep the most significant points; without it, random ones.
         hybrid_elimination: weigh matches by their validity; without it, all alike.
-        matched_by: the model by whose features :func:`idam.register` matches, where this one's change with the pose.
     """
 
     features: str = "gnn"
@@ -49,4 +48,3 @@ class Config:
     convolution: bool = True
     hard_elimination: bool = True
     hybrid_elimination: bool = True
-    matched_by: str = "general"

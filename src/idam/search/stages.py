@@ -130,7 +130,7 @@ def choose(
     if scope.max_angle > TAUGHT:
         tried = improve(asked, matching, reaches(method)[0], method)
         answers = judged(ranked([*found.answers, *tried]), matching, method, fine)
-        return Found(least_turned(answers, scope.guess), matching)
+        return Found(smallest_rotation(answers, scope.guess), matching)
     nearby = scope.around(asked[0], NEAR)
     near = explain(np.concatenate([asked, nearby.within(agreed)]), matching, nearby, method, fine)
     surer = confidence(near.evidence)
@@ -152,7 +152,7 @@ def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fi
         slid = likeliest(mistaken, matching, SLID)
         answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
-    return Found(least_turned(judged(answers[:CONTENDERS], matching, method, fine), scope.guess), matching)
+    return Found(smallest_rotation(judged(answers[:CONTENDERS], matching, method, fine), scope.guess), matching)
 
 
 def homed(guess: Array, matching: Matching) -> Array:
@@ -185,7 +185,7 @@ def first_of_its_kind(answers: list[Answer]) -> list[Answer]:
     return [answers[n] for n in distinct(np.array([answer.transformation for answer in answers]))]
 
 
-def least_turned(answers: list[Answer], guess: Array) -> list[Answer]:
+def smallest_rotation(answers: list[Answer], guess: Array) -> list[Answer]:
     """The answers, first the one nearest to the guess of those that are as likely to be right as the best.
 
     Something has to choose among the poses of a symmetric object, and scans stand upright more often than not.
