@@ -3,8 +3,8 @@
     python benchmarks/scale.py [--points 1000 10000 100000 1000000] [--repeats 3] [--seed 0] [--json FILE]
 
 Each pair is two views of one part made here, sampled independently, cropped by a half-space each and noisy, so that no
-data is needed. Each size has a process of its own, whose peak memory is Python, PyTorch, the networks, both clouds and
-all the work; the CPU's seconds, over all threads, say more than the clock's where other programs run.
+data is needed. Each size has a process of its own, whose peak memory is Python, what this script imports, both clouds
+and all the work; the CPU's seconds, over all threads, say more than the clock's where other programs run.
 """
 
 from __future__ import annotations
