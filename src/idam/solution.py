@@ -99,9 +99,10 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     last = refine == "gicp"  # unless another method is asked for, the last stage takes over from the search
     start = found.best if last and method != "symmetric" else align(surfaces, found.best, reaches(method)[1], method)
     best, pairs = finished(surfaces, lambda: dense(clouds), start, method, last)
-    poses = [(best, found.answers[0].score), *((other.transformation, other.score) for other in found.answers[1:])]
+    first, *others = found.answers
+    found = replace(found, answers=[replace(first, transformation=best), *others])
     return Solution(
-        answers=[Hypothesis(clouds.leave(pose), score) for pose, score in poses],
+        answers=[Hypothesis(clouds.leave(answer.transformation), answer.score) for answer in found.answers],
         evidence=found.evidence,
         matches=Matches(
             matches.source * unit + clouds.source.centre,

@@ -214,8 +214,9 @@ def test_verified_is_refined_on_the_fine_clouds_and_measured_there(
 ) -> None:
     (answer,) = improve(np.array([rigid(2, 0.01)]), matching, 1.0, "none")
     checked = verified(answer, matching, fine, method)
-    expected = align(fine, answer.transformation, reaches(method)[1], method, 6)
-    np.testing.assert_array_equal(checked.transformation, expected)
+    expected = align(fine, answer.transformation, reaches(method)[1], method)
+    # in a few steps it comes within a thousandth of the spacing of where all of them end
+    np.testing.assert_allclose(checked.transformation, expected, atol=1e-3 * fine.spacing)
     reach = TOUCHING * matching.clouds.surfaces.spacing
     assert (checked.close, checked.off) == exactness(fine, checked.transformation, reach)
     # what the matched clouds said of it stays
