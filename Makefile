@@ -19,10 +19,10 @@ demo: $(VENV)/.installed ## align two shipped scans and write the page to look a
 	$(BIN)/idam demo
 
 test: $(VENV)/.installed-dev ## run the tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-core: $(CORE)/.installed ## run the tests of the core in an environment of the core alone
-	$(CORE)/bin/python -m pytest --ignore tests/network --ignore tests/lab --ignore tests/rivals
+	$(CORE)/bin/python -m pytest -n auto --dist loadfile --ignore tests/network --ignore tests/lab --ignore tests/rivals
 
 lint: $(VENV)/.installed-dev ## check style and types
 	$(BIN)/ruff check
@@ -48,7 +48,7 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/pip
 
 # without trimesh: all but the meshes has to do without it
 $(CORE)/.installed: pyproject.toml constraints.txt | $(CORE)/bin/pip
-	$(CORE)/bin/python $(PIP) install -c constraints.txt -e . pytest pytest-timeout hypothesis
+	$(CORE)/bin/python $(PIP) install -c constraints.txt -e . pytest pytest-timeout pytest-xdist hypothesis
 	$(CORE)/bin/python $(PIP) uninstall --yes trimesh
 	@touch $@
 
