@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from idam.network.config import Config
-from idam.network.features import GNN, gnn
+from idam.network.features import GNN
+from idam.network.features import gnn as features
 from idam.network.features.gnn import neighbours_of
 from idam.network.model import IDAM
 from idam.network.pretrained import load_model
@@ -41,8 +42,8 @@ def no_search(monkeypatch) -> None:
     def search(*_: object) -> None:
         raise AssertionError("neighbours were given, and yet searched for")
 
-    monkeypatch.setattr(gnn, "nearest_by_tree", search)
-    monkeypatch.setattr(gnn, "nearest_neighbours", search)
+    monkeypatch.setattr(features, "nearest_by_tree", search)
+    monkeypatch.setattr(features, "nearest_neighbours", search)
 
 
 @pytest.mark.parametrize("train", [False, True])
@@ -115,7 +116,7 @@ def test_the_whole_network_leaves_python_with_one_try(leave, clouds, randn, clos
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device here")
 def test_a_gpu_finds_neighbours_itself(gnn, clouds, close, monkeypatch):
     near = gnn.graph(clouds[0])
-    monkeypatch.setattr(gnn, "nearest_by_tree", None)
+    monkeypatch.setattr(features, "nearest_by_tree", None)
     assert torch.equal(gnn.cuda().graph(clouds[0].cuda()).cpu().sort(-1).values, near.sort(-1).values)
 
 
