@@ -218,6 +218,8 @@ NAMES += ["a.stl", "ascii.stl", "a.las", "a.laz", "coff.off", "a.ptx", "a.bin", 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_damaged_files(folder: Path, name: str) -> None:
+    if name.endswith(".stl"):
+        pytest.importorskip("trimesh", reason="STL is read with trimesh")
     valid, path = real_file(folder, name), folder / name
     assert read_or_refuse(path, valid) is not None
 
