@@ -53,18 +53,15 @@ class Level:
     voxel_size: float
     features: dict[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
     _surfaces: dict[float, Surface] = field(default_factory=dict, repr=False)
-    _spacing: list[float] = field(default_factory=list, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: small_gicp's surfaces do not, and are made anew there."""
         return {**self.__dict__, "_surfaces": {}}
 
-    @property
+    @cached_property
     def spacing(self) -> float:
         """The median distance of neighbouring points, in input units."""
-        if not self._spacing:
-            self._spacing.append(spacing_of(self.points))
-        return self._spacing[0]
+        return spacing_of(self.points)
 
     @property
     def spacing_rung(self) -> int:
