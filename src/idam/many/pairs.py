@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from idam import rigid
-from idam.clouds.prepared import Prepared
 from idam.errors import InputError
 from idam.io.files import StrPath, one_line
 from idam.many.scans import Scan
@@ -137,7 +136,7 @@ def results(scans: Sequence[Scan], asked: Mapping[Pair, dict[str, Any]], jobs: i
         return
     with (
         one_thread_each(),
-        ProcessPoolExecutor(jobs, get_context("spawn"), begin, ([portable(scan.prepared) for scan in scans],)) as pool,
+        ProcessPoolExecutor(jobs, get_context("spawn"), begin, ([scan.prepared for scan in scans],)) as pool,
     ):
         futures = {pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
         try:
@@ -164,11 +163,6 @@ def one_thread_each() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-def portable(cloud: Prepared) -> Prepared:
-    """A prepared cloud without what cannot be sent to another process and is quickly made again there."""
-    return replace(cloud, levels={size: replace(level, _surfaces={}) for size, level in cloud.levels.items()})
 
 
 _scans: list[Any] = []
