@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from idam import rigid
 from idam.align import METHODS
-from idam.clouds.frame import check_points
 from idam.clouds.prepared import FINE, SMALL, Prepared
 from idam.clouds.pyramid import Pyramid
 from idam.errors import InputError
@@ -164,7 +163,6 @@ def prepared(data: Any, name: str) -> Prepared:
             points = as_point_cloud(data).points
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
-    check_points(points, name)
     return Prepared.of(points, name)
 
 

@@ -9,9 +9,7 @@ import numpy as np
 from idam import rigid
 from idam.align import align, reaches
 from idam.align.information import information
-from idam.align.patches import Dense
 from idam.align.polish import finished
-from idam.clouds.prepared import ALL
 from idam.clouds.pyramid import Pyramid
 from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
@@ -112,15 +110,12 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
         information=clouds.information_left(information(pairs)),
         strength=strength(surfaces, best).carried(clouds.to_input / unit),
         distance=TOUCHING * surfaces.spacing * unit,
-        source_misses=unit * surfaces.target.nearest(rigid.apply(best, surfaces.source.points))[0],
-        target_misses=unit * surfaces.source.nearest(rigid.apply(rigid.inverse(best), surfaces.target.points))[0],
+        source_misses=unit * surfaces.nearest(best)[0],
+        target_misses=unit * surfaces.swapped.nearest(rigid.inverse(best))[0],
     )
 
 
-def dense(clouds: Pyramid) -> tuple[Dense, Dense]:
+def dense(clouds: Pyramid) -> tuple[Array, Array]:
     """Both clouds in working units with all points, or every n-th."""
-    level = clouds.fine
-    if level.source_level.voxel_size == ALL:
-        return Dense.of_surface(level.surfaces.source), Dense.of_surface(level.surfaces.target)
-    source, target = (Dense.of(cloud.every(DENSE) / clouds.unit) for cloud in (clouds.source, clouds.target))
+    source, target = (cloud.every(DENSE) / clouds.unit for cloud in (clouds.source, clouds.target))
     return source, target

@@ -8,7 +8,7 @@ import pytest
 from idam import rigid
 from idam.align import align, reaches
 from idam.align.information import information
-from idam.align.patches import Dense, Pairs
+from idam.align.patches import Pairs
 from idam.align.polish import finished, polish
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.rigid import Array
@@ -60,7 +60,7 @@ def aligned(surfaces: Surfaces, seed: int) -> tuple[Array, Pairs]:
     if len(surfaces.source.points) <= 1024:
         start = align(surfaces, start, reaches("symmetric")[1], "symmetric")
         return finished(surfaces, lambda: (None, None), start, "symmetric", True)  # type: ignore
-    return polish(surfaces, start, lambda: (Dense.of_surface(surfaces.source), Dense.of_surface(surfaces.target)))
+    return polish(surfaces, start, lambda: (surfaces.source.points, surfaces.target.points))
 
 
 @pytest.mark.parametrize(

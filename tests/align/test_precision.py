@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from idam import rigid
-from idam.align.patches import Dense
+
 from idam.align.polish import polish
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.clouds.voxels import downsample
@@ -27,7 +27,7 @@ def error(count: int, seed: int) -> float:
     thinned = [downsample(points, 0.03) for points in (source, target)]
     surfaces = Surfaces(*(Surface.of(points) for points in thinned), max(spacing_of(points) for points in thinned))
     start = TRUTH @ rigid.exp(rng.normal(scale=0.003, size=6))
-    found, _ = polish(surfaces, start, lambda: (Dense.of(source), Dense.of(target)))
+    found, _ = polish(surfaces, start, lambda: (source, target))
     return float(np.linalg.norm(rigid.log(rigid.inverse(found) @ TRUTH)))
 
 

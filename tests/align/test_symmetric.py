@@ -81,7 +81,7 @@ def test_clouds_that_move_move_the_answer() -> None:
 def test_clouds_exchanged_invert_the_answer() -> None:
     surfaces = pair(*scans(4))
     forth = symmetric(surfaces, NUDGE)
-    back = symmetric(surfaces.swapped(), np.linalg.inv(NUDGE))
+    back = symmetric(surfaces.swapped, np.linalg.inv(NUDGE))
     angle, shift = off(back @ forth, np.eye(4))
     assert angle < 0.1
     assert shift < 0.001

@@ -104,7 +104,7 @@ def test_disjoint_clouds_do_not_touch() -> None:
 
 
 def test_swapped_exchanges_the_surfaces(overlapping: Surfaces) -> None:
-    other = overlapping.swapped()
+    other = overlapping.swapped
     assert other.source is overlapping.target
     assert other.target is overlapping.source
     assert other.spacing == overlapping.spacing

@@ -50,7 +50,7 @@ def test_is_that_of_brute_force(overlapping: Surfaces, matrix: np.ndarray) -> No
 
 def test_swapping_the_clouds_changes_nothing(overlapping: Surfaces) -> None:
     forth = overlap(overlapping, POSE)
-    assert overlap(overlapping.swapped(), np.linalg.inv(POSE)) == pytest.approx(forth, abs=1e-12)
+    assert overlap(overlapping.swapped, np.linalg.inv(POSE)) == pytest.approx(forth, abs=1e-12)
     assert 0.2 < forth < 0.9
 
 
@@ -96,7 +96,7 @@ def test_shares_are_those_of_brute_force_point_by_point(overlapping: Surfaces) -
 
 
 def test_shares_swap_with_the_clouds(overlapping: Surfaces) -> None:
-    assert shares(overlapping.swapped(), np.linalg.inv(POSE)) == shares(overlapping, POSE)[::-1]
+    assert shares(overlapping.swapped, np.linalg.inv(POSE)) == shares(overlapping, POSE)[::-1]
 
 
 def test_all_of_a_part_lies_on_the_whole_and_little_of_the_whole_on_the_part() -> None:
@@ -135,7 +135,7 @@ def test_exactness_is_that_of_the_definition(overlapping: Surfaces, matrix: np.n
 
 
 def test_exactness_swaps(overlapping: Surfaces) -> None:
-    back = exactness(overlapping.swapped(), np.linalg.inv(POSE), 0.3)
+    back = exactness(overlapping.swapped, np.linalg.inv(POSE), 0.3)
     np.testing.assert_allclose(back, exactness(overlapping, POSE, 0.3), rtol=1e-9)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from idam import rigid
-from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surface, Surfaces
+from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surfaces
 from idam.rigid import Array
 
 __all__ = ["Dense", "Pairs", "Patches", "patch_size"]
@@ -25,6 +25,9 @@ they are asked at: with noise of one spacing, patches of 7 points (3 standard de
 30 (6)."""
 LARGEST = 60
 """Points of a patch at most."""
+BLOCK, EXCERPT = 8.0, 8000
+"""Spacings of the thinned points along a block of those not thinned, and how many of these tell their noise: a tree of
+all takes longer than the rest of the last stage."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,6 @@ class Dense:
         import small_gicp
 
         return cls(points, small_gicp.KdTree(points))
-
-    @classmethod
-    def of_surface(cls, surface: Surface) -> Dense:
-        """All points of a surface, whose tree is there."""
-        return cls(surface.points, surface.tree)
 
     def patches(self, places: Array, size: int) -> tuple[Patches, Array, Array]:
         """The means of the ``size`` points nearest to each of the places (C, 3), with normals of more where few.
@@ -155,14 +153,28 @@ class Pairs:
         return np.concatenate([np.cross(self.points, normals), normals], 1)
 
 
-def patch_size(cloud: Dense, places: Array) -> int:
-    """Points of a patch that reaches past the noise: 1 where the noise is far below the spacing of the points."""
+def patch_size(points: Array, spacing: float) -> int:
+    """Points of a patch that reaches past the noise: 1 where the noise is far below the spacing of the points.
+
+    Args:
+        points: (N, 3), not thinned.
+        spacing: of the thinned points.
+    """
     size = 1
-    some = places[:: max(1, len(places) // SAMPLE)]
+    points = excerpt(points, BLOCK * spacing)
+    cloud = Dense.of(points)
     for _ in range(2):
-        _, radii, noise = cloud.patches(some, size)
+        _, radii, noise = cloud.patches(points[:: max(1, len(points) // SAMPLE)], size)
         neighbours = max(size, NEIGHBOURS)
         size = int(np.clip(round(neighbours * float(np.median(THICK * noise / radii)) ** 2), 1, LARGEST))
         if size <= NEIGHBOURS:
             break
     return size
+
+
+def excerpt(points: Array, side: float) -> Array:
+    """All of the points (N, 3) in some blocks of space of a side, about :data:`EXCERPT` of them."""
+    every = len(points) // EXCERPT + 1
+    number = np.floor(points / side) @ np.array([1.0, 2.0, 3.0])
+    some = points.compress(number % every == 0, axis=0)
+    return some if len(some) > EXCERPT // 2 else points

@@ -54,7 +54,7 @@ def _step(surfaces: Surfaces, transformation: Array, reach: float) -> Array:
     """One step of Gauss and Newton, a rotation vector and a translation, (6,), to apply after the transform."""
     spacings = reach / surfaces.spacing
     to_target, mine, row = surfaces.touching(transformation, spacings)
-    to_source, theirs, column = surfaces.swapped().touching(rigid.inverse(transformation), spacings)
+    to_source, theirs, column = surfaces.swapped.touching(rigid.inverse(transformation), spacings)
     i, j = np.concatenate([mine, column]), np.concatenate([row, theirs])
     distance = np.concatenate([to_target, to_source])
     p = rigid.apply(transformation, surfaces.source.points[i])

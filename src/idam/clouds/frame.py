@@ -22,8 +22,8 @@ LARGEST = 1e100
 """Coordinates past this overflow when squared and summed: as good as infinite."""
 
 
-def check_points(points: Array, name: str) -> None:
-    """Raise InputError unless points (N, 3) can be registered at all."""
+def check_points(points: Array, name: str) -> tuple[Array, float]:
+    """The :func:`core` of points (N, 3); raise InputError unless they can be registered at all."""
     if len(points) < MIN_POINTS:
         raise InputError(f"{name}: has {len(points)} points, at least {MIN_POINTS} are needed; give a denser scan")
     if not np.abs(points).max() < LARGEST:  # also false for NaN
@@ -37,6 +37,7 @@ def check_points(points: Array, name: str) -> None:
     spread = np.sqrt(np.clip(np.linalg.eigvalsh(centred.T @ centred), 0, None))
     if spread[1] <= FLATNESS * spread[2]:
         raise InputError(f"{name}: all points lie on a line, which leaves a rotation free; give a scan of a surface")
+    return centre, radius
 
 
 def core(points: Array) -> tuple[Array, float]:

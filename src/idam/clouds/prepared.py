@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from idam.clouds.frame import core, without_strays
+from idam.clouds.frame import check_points, without_strays
 from idam.clouds.surfaces import Surface, spacing_of
 from idam.clouds.viewpoint import DepthMap
 from idam.clouds.voxels import downsample, ladder, rung, rung_for
@@ -105,8 +105,12 @@ class Prepared:
 
     @classmethod
     def of(cls, points: Array, name: str) -> Prepared:
-        """From points (N, 3) that :func:`idam.clouds.frame.check_points` has passed."""
-        return cls(points, name, *core(points))
+        """From points (N, 3).
+
+        Raises:
+            InputError: they cannot be registered (:func:`idam.clouds.frame.check_points`).
+        """
+        return cls(points, name, *check_points(points, name))
 
     @property
     def unit(self) -> float:

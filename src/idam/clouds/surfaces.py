@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -68,6 +68,18 @@ class Surfaces:
     source: Surface
     target: Surface
     spacing: float
+    _asked: dict[bytes, tuple[Array, Rows]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def nearest(self, transformation: Array) -> tuple[Array, Rows]:
+        """The distance (N,) from each source point, moved by a transform (4, 4), to the nearest target point, its row.
+
+        The last answer is kept: what overlaps, what is alike and what is left are asked of one pose after the other.
+        """
+        pose = transformation.tobytes()
+        if pose not in self._asked:
+            self._asked.clear()
+            self._asked[pose] = self.target.nearest(rigid.apply(transformation, self.source.points))
+        return self._asked[pose]
 
     def touching(self, transformation: Array, reach: float = TOUCHING) -> tuple[Array, Rows, Rows]:
         """What lies on what under a transform (4, 4): source points within ``reach`` spacings of a target point.
@@ -76,7 +88,7 @@ class Surfaces:
             For each of the C source points that lie on the target the distance to the nearest target point, the row of
             the source point and the row of that target point, (C,) each.
         """
-        distance, row = self.target.nearest(rigid.apply(transformation, self.source.points))
+        distance, row = self.nearest(transformation)
         on = np.flatnonzero(distance <= reach * self.spacing)
         return distance[on], on, row[on]
 
@@ -87,6 +99,7 @@ class Surfaces:
         agree = np.abs((normals * self.target.normals[theirs]).sum(1)) >= SAME_SURFACE
         return mine[agree], theirs[agree]
 
+    @cached_property
     def swapped(self) -> Surfaces:
         """With source and target exchanged."""
         return Surfaces(self.target, self.source, self.spacing)

@@ -43,9 +43,12 @@ def agreeing_transforms(matches: FeatureMatches, seeds: int) -> Array:
     # the seed itself is compatible with whatever its best companion is
     weight = np.concatenate([weight.max(1, keepdims=True), weight], 1)
     transforms = weighted_procrustes(source[index], target[index], weight.astype(np.float64))
+    moments = _moments(source, target)
+    near = _together(moments, transforms, matches.tolerance)
     for _ in range(ROUNDS):
-        transforms = weighted_procrustes(source, target, _together(matches, transforms))
-    number = _together(matches, transforms).sum(1)
+        transforms = weighted_procrustes(source, target, near)
+        near = _together(moments, transforms, matches.tolerance)
+    number = near.sum(1)
     return transforms[np.argsort(-number, kind="stable")]
 
 
@@ -86,10 +89,23 @@ def _second_order_compatibility(source: Array, target: Array, tolerance: float) 
     return second_order
 
 
-def _together(matches: FeatureMatches, transforms: Array) -> Array:
-    """1 for the matches (S, M) that each of S transforms brings within the tolerance, 0 for the others."""
-    miss = rigid.apply(transforms, matches.source) - matches.target
-    near: Array = (np.einsum("smd,smd->sm", miss, miss) < matches.tolerance**2).astype(np.float64)
+def _moments(source: Array, target: Array) -> Array:
+    """What the square distances of M matches under any transform are linear in, (17, M)."""
+    products = (target[:, :, None] * source[:, None, :]).reshape(-1, 9)
+    squares = (source**2).sum(1) + (target**2).sum(1)
+    return np.concatenate([squares[None], np.ones((1, len(source))), products.T, source.T, target.T])
+
+
+def _together(moments: Array, transforms: Array, tolerance: float) -> Array:
+    """1 for the matches (S, M) that each of S transforms brings within the tolerance, 0 for the others.
+
+    ``|R p + t - q|^2 = p^2 + q^2 + t^2 - 2 q^T R p + 2 t^T R p - 2 t^T q``: for all matches and transforms one product.
+    """
+    rotation, shift = transforms[:, :3, :3], transforms[:, :3, 3]
+    back = (shift[:, None] @ rotation)[:, 0]
+    one, square = np.ones((len(shift), 1)), (shift**2).sum(1, keepdims=True)
+    factors = np.concatenate([one, square, -2 * rotation.reshape(-1, 9), 2 * back, -2 * shift], 1)
+    near: Array = (product(factors, moments) < tolerance**2).astype(np.float64)
     return near
 
 

@@ -17,7 +17,7 @@ def shares(surfaces: Surfaces, transformation: Array, reach: float = TOUCHING) -
     A point lies on the nearest one of the other cloud, within ``reach`` spacings, where their normals agree.
     """
     mine, _ = surfaces.alike(transformation, reach)
-    theirs, _ = surfaces.swapped().alike(rigid.inverse(transformation), reach)
+    theirs, _ = surfaces.swapped.alike(rigid.inverse(transformation), reach)
     return len(mine) / len(surfaces.source.points), len(theirs) / len(surfaces.target.points)
 
 
@@ -43,7 +43,7 @@ def exactness(surfaces: Surfaces, transformation: Array, reach: float) -> tuple[
         within reach.
     """
     spacings = reach / surfaces.spacing
-    ways = (surfaces, transformation), (surfaces.swapped(), rigid.inverse(transformation))
+    ways = (surfaces, transformation), (surfaces.swapped, rigid.inverse(transformation))
     within, off = [np.empty(0)], [np.empty(0)]
     for pair, way in ways:
         distance, mine, theirs = pair.touching(way, spacings)

@@ -241,5 +241,7 @@ def _as_scanned(source: Points, target: Points, rng: np.random.Generator) -> Sca
 
 def _in_working_coordinates(source: Points, target: Points, truth: Points, count: int) -> ScanPair | None:
     """Clouds and the truth (4, 4) as :func:`idam.register` sees them; None where too few points are left."""
+    if min(len(source), len(target)) < FEWEST:
+        return None
     pair = as_registered(source, target, truth, count)
     return pair if min(len(pair.source), len(pair.target)) >= FEWEST else None

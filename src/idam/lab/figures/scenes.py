@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from idam.clouds.frame import check_points
 from idam.clouds.prepared import Prepared
 from idam.clouds.pyramid import Pyramid
 from idam.errors import InputError
@@ -97,9 +96,7 @@ def read_scans(paths: Sequence[Path]) -> list[Scan]:
 
 def _read_pair(source_path: Path, target_path: Path) -> Scan:
     source, target = read_point_cloud(source_path).points, read_point_cloud(target_path).points
-    check_points(source, str(source_path))
-    check_points(target, str(target_path))
-    clouds = Pyramid(Prepared.of(source, "source"), Prepared.of(target, "target"))
+    clouds = Pyramid(Prepared.of(source, str(source_path)), Prepared.of(target, str(target_path)))
     generator = torch.Generator().manual_seed(0)
     return (
         f"{source_path.stem}\nto {target_path.stem}",
