@@ -22,10 +22,6 @@ from idam.search.strength import Strength, strength
 
 __all__ = ["Solution", "solve"]
 
-FEW_POINTS = 1024
-"""Points of the larger cloud up to which both count as sparse, and are aligned symmetrically."""
-
-
 DENSE = 200_000
 """Points of each cloud that the last stage uses at most."""
 
@@ -90,7 +86,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
         max_angle: largest rotation in degrees, from the guess.
         refine: method of fine alignment, or None.
     """
-    method = "symmetric" if refine == "gicp" and clouds.fine.size <= FEW_POINTS else refine or "none"
+    method = "symmetric" if refine == "gicp" and clouds.sparse else refine or "none"
     scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle, given=guess is not None)
     found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches

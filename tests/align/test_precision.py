@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from idam import rigid
-
 from idam.align.polish import polish
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.clouds.voxels import downsample

@@ -10,6 +10,7 @@ import numpy as np
 
 from idam import rigid
 from idam.clouds.surfaces import NEIGHBOURS, SAME_SURFACE, SAMPLE, Surfaces
+from idam.describe.normals import least_variance
 from idam.rigid import Array
 
 __all__ = ["Dense", "Pairs", "Patches", "patch_size"]
@@ -59,11 +60,11 @@ class Dense:
             The patches, their radii (C,) and the standard deviations (C,) of points off their planes.
         """
         row, square = self.tree.batch_knn_search(places, min(max(size, NEIGHBOURS), len(self.points)))
-        points = self.points[row.astype(np.int64)]
-        spread = points - points.mean(1, keepdims=True)
-        variance, axes = np.linalg.eigh(spread.swapaxes(1, 2) @ spread / (row.shape[1] - 3))
-        patches = Patches(points[:, :size].mean(1), axes[:, :, 0])
-        return patches, np.sqrt(square[:, -1]), np.sqrt(variance[:, 0].clip(0))
+        near = np.stack([coordinate.take(row) for coordinate in self.points.T])
+        spread = near - near.mean(2, keepdims=True)
+        covariance = np.einsum("ink,jnk->nij", spread, spread) / (row.shape[1] - 3)
+        normals, variance = least_variance(covariance, places)
+        return Patches(near[:, :, :size].mean(2).T, normals), np.sqrt(square[:, -1]), np.sqrt(variance.clip(0))
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def finished(
 
 
 def polish(surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Array, Array]]) -> tuple[Array, Pairs]:
-    """Lay points of both surfaces on each other and then, where noise goes past the spacing, means of many points.
+    """Lay points of both surfaces on each other or, where noise goes past their spacing, means of many points.
 
     Args:
         surfaces: in working coordinates, thinned.
@@ -65,15 +65,14 @@ def polish(surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Array, Ar
     Returns:
         The transform (4, 4), and the pairs under it that fixed it.
     """
-    found = _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
     points = dense()
     size = max(patch_size(cloud, surfaces.spacing) for cloud in points)
     if size == 1:
-        return found
+        return _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
     source, target = (Dense.of(cloud) for cloud in points)
     places = surfaces.source.points
     patches, _, _ = source.patches(places[:: max(1, len(places) * size // (EACH * len(source.points)))], size)
-    return _settled(lambda at: Pairs.of_patches(patches, target, at, size), found[0], surfaces.spacing)
+    return _settled(lambda at: Pairs.of_patches(patches, target, at, size), start, surfaces.spacing)
 
 
 def _settled(pairs_of: Callable[[Array], Pairs], start: Array, spacing: float) -> tuple[Array, Pairs]:
@@ -99,4 +98,5 @@ def _step(pairs: Pairs) -> Array:
     gradient = pairs.gradients(pairs.normals)
     weighted = gradient * pairs.weights[:, None]
     # as of one pair each: where nothing holds, it stays
-    return np.linalg.solve(weighted.T @ gradient + np.eye(6), -(weighted.T @ pairs.residuals))
+    # what is solved for takes the weights as they are; they fall with the residuals, and steps come out too short
+    return np.linalg.solve(weighted.T @ gradient * pairs.slope + np.eye(6), -(weighted.T @ pairs.residuals))

@@ -23,10 +23,12 @@ from idam.errors import InputError
 from idam.io.files import write_bytes
 from idam.rigid import Array
 
-__all__ = ["ALL", "FINE", "LARGER", "SMALL", "Level", "Prepared"]
+__all__ = ["ALL", "FINE", "LARGER", "SMALL", "SPARSE", "Level", "Prepared"]
 
-SMALL = 1024
-"""Points of the larger cloud that are matched first: what the descriptor was trained on."""
+SPARSE = 1024
+"""Points of the larger cloud up to which all are matched, and aligned as sparse clouds are."""
+SMALL = 640
+"""Points of the larger cloud that are matched first, where there are more."""
 LARGER = 2000
 """Points of the larger cloud that are matched where the small clouds do not settle the matter."""
 FINE = 10_000
@@ -35,6 +37,8 @@ FORMAT = 1
 """Of saved clouds: changes when they can no longer be read, or would give other answers."""
 BASE = 100_000
 """Points that are kept of a cloud, besides those given: all levels are thinned from them."""
+FINER = 2.0
+"""Voxel sizes of the fine level from which on others are thinned from it."""
 ALL = 0.0
 """The voxel size that stands for no voxel grid at all."""
 
@@ -140,10 +144,17 @@ class Prepared:
     def level(self, voxel_size: float) -> Level:
         """The cloud on a voxel grid."""
         if voxel_size not in self.levels:
-            # a voxel grid merges copies of a point, too
-            thinned = np.unique(self.base, axis=0) if voxel_size == ALL else downsample(self.base, voxel_size)
+            if voxel_size == ALL:  # a voxel grid merges copies of a point, too
+                thinned = np.unique(self.base, axis=0)
+            else:
+                thinned = downsample(self.finer(voxel_size), voxel_size)
             self.levels[voxel_size] = Level(thinned, voxel_size)
         return self.levels[voxel_size]
+
+    def finer(self, voxel_size: float) -> Array:
+        """What a level is thinned from: the cloud's own fine level where that is fine enough, or else all."""
+        own = self.voxel_size(FINE)
+        return self.level(own).points if ALL < FINER * own <= voxel_size else self.base
 
     def every(self, most: int) -> Array:
         """Points (N, 3) relative to the centre, in input units: every n-th, so that ``most`` at most are left.

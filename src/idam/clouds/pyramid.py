@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from idam import rigid
 from idam.clouds.frame import MIN_POINTS
-from idam.clouds.prepared import ALL, FINE, LARGER, SMALL, Level, Prepared
+from idam.clouds.prepared import FINE, LARGER, SMALL, SPARSE, Level, Prepared
 from idam.clouds.surfaces import Surfaces
 from idam.clouds.viewpoint import FreeSpace
 from idam.describe.invariant import Descriptor
@@ -105,9 +105,10 @@ class Pyramid:
         Raises:
             InputError: too few or too many points are left to match.
         """
-        level = (
-            self.with_points(SMALL) if self.voxel_size is None else self.at(max(self.voxel_size, FINEST * self.unit))
-        )
+        if self.voxel_size is None:
+            level = self.fine if self.sparse else self.with_points(SMALL)
+        else:
+            level = self.at(max(self.voxel_size, FINEST * self.unit))
         self._check(level)
         return level
 
@@ -122,9 +123,14 @@ class Pyramid:
         return self.with_points(FINE)
 
     @property
+    def sparse(self) -> bool:
+        """Whether there are so few points that all of them are matched."""
+        return self.fine.size <= SPARSE
+
+    @property
     def all_small(self) -> bool:
         """Whether there are no larger clouds to match: the small ones hold all points, or the caller chose them."""
-        return self.voxel_size is not None or self.small.source_level.voxel_size == ALL
+        return self.voxel_size is not None or self.sparse
 
     def with_points(self, count: int) -> PairLevel:
         """Both clouds on the voxel grid that leaves about ``count`` points of the larger."""

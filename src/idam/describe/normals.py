@@ -8,7 +8,7 @@ import numpy as np
 
 from idam.describe.neighbours import Array, Neighbours, Reach, nearest_neighbours, within_reach
 
-__all__ = ["estimate_normals", "normal_reach", "normals_from_neighbours"]
+__all__ = ["estimate_normals", "least_variance", "normal_reach", "normals_from_neighbours"]
 
 # Points, itself included, that a normal is taken from where the radius holds fewer: any fewer span no plane.
 FEWEST_POINTS = 3
@@ -58,7 +58,7 @@ def normals_from_neighbours(points: Array, near: Neighbours) -> Array:
     centred = points - points.mean(0, dtype=np.float64)
     centred /= max(np.sqrt(np.square(centred).sum(-1).mean()), float(np.finfo(points.dtype).tiny))
     outward = centred - OFF_CENTRE * _asymmetry(centred)
-    normal = _least_variance(_covariance(centred, near), outward)
+    normal, _ = least_variance(_covariance(centred, near), outward)
     inward = (normal * outward).sum(-1, keepdims=True) < 0
     return np.where(inward, -normal, normal).astype(points.dtype)
 
@@ -87,24 +87,25 @@ def _covariance(points: Array, near: Neighbours) -> Array:
     return covariance
 
 
-def _least_variance(covariance: Array, outward: Array) -> Array:
-    """Eigenvector (N, 3) of the smallest eigenvalue of ``covariance`` (N, 3, 3), of either sign.
+def least_variance(covariance: Array, outward: Array) -> tuple[Array, Array]:
+    """Eigenvector (N, 3) of the smallest eigenvalue of ``covariance`` (N, 3, 3), of either sign, and that value (N,).
 
     In closed form, several times as fast as ``np.linalg.eigh``. C - l I, with l the smallest eigenvalue, has its rows
     in the plane of the other two eigenvectors, so the eigenvector is the cross product of two rows, the two that give
     the longest. Where l is a double eigenvalue the rows are all parallel: then it is the part of ``outward`` (N, 3)
     that is perpendicular to them, or, where there is none, of a coordinate axis.
     """
-    rows = covariance - _smallest_eigenvalue(covariance)[:, None, None] * np.eye(3)
+    smallest = _smallest_eigenvalue(covariance)
+    rows = covariance - smallest[:, None, None] * np.eye(3)
     normal = _longest(_cross(rows, rows[:, [2, 0, 1]]))
     is_plane = _norm(normal) > LINE * np.square(rows).sum((-2, -1))[:, None]
     if is_plane.all():
-        return _unit(normal)
+        return _unit(normal), smallest
     row = _unit(_longest(rows))
     axis = np.eye(3)[np.abs(row).argmin(-1)]
     across = _without(outward, row)
     is_outward = _norm(across) > LINE * _norm(outward)
-    return _unit(np.where(is_plane, normal, np.where(is_outward, across, _without(axis, row))))
+    return _unit(np.where(is_plane, normal, np.where(is_outward, across, _without(axis, row)))), smallest
 
 
 def _smallest_eigenvalue(matrix: Array) -> Array:

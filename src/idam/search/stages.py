@@ -177,6 +177,7 @@ def to_match(clouds: Pyramid) -> Iterator[tuple[PairLevel, int]]:
     """Clouds, and from how many of their matches to grow sets of agreeing ones."""
     if not clouds.all_small:
         yield clouds.small, SEEDS[0]
+        yield clouds.with_points(1024), SEEDS[0]
     yield clouds.larger, SEEDS[1]
 
 
