@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from idam import rigid
 from idam.clouds.pyramid import PairLevel
+from idam.clouds.surfaces import SAME_SURFACE, TOUCHING
 from idam.describe.invariant import Descriptor
 from idam.describe.products import product
 from idam.rigid import Array, Rows
@@ -25,6 +26,8 @@ REACH = 1.7
 """Tolerances within which a refined transform counts as bringing a match together."""
 FEW = 50
 """Matches that must be there before a share of them says much."""
+SOME = 250
+"""Points that tell which of many transforms to look into."""
 AGAINST, FOR = -2.0, 4.0
 """Least and most that one pair of points says against or for a transform, as a logarithm of likelihoods."""
 
@@ -82,11 +85,26 @@ class Matching:
         points alike, by row or by column, whichever is less; over the number of points of the smaller cloud. Points
         like all others say nothing; those that lie on others unlike them speak against the transform.
         """
-        rows, columns = self.clouds.surfaces.alike(transformation)
+        return float(self._speaks(*self.clouds.surfaces.alike(transformation)).sum() / min(self.score.shape))
+
+    def likelihoods(self, transformations: Array) -> Array:
+        """The :meth:`likelihood` of each of the transforms (S, 4, 4), by some of the points, (S,)."""
+        source, target = self.clouds.surfaces.source, self.clouds.surfaces.target
+        some = np.arange(0, len(source.points), len(source.points) // SOME + 1)
+        moved = rigid.apply(transformations, source.points[some])
+        distance, nearest = (x.reshape(len(transformations), -1) for x in target.nearest(moved.reshape(-1, 3)))
+        normals = source.normals[some] @ transformations[:, :3, :3].swapaxes(1, 2)
+        cosine = np.einsum("smd,smd->sm", normals, target.normals[nearest])
+        on = (distance <= TOUCHING * self.clouds.spacing) & (np.abs(cosine) >= SAME_SURFACE)
+        speaks = np.where(on, self._speaks(some[None], nearest), 0.0)
+        return np.asarray(speaks.sum(1) * len(source.points) / (len(some) * min(self.score.shape)))
+
+    def _speaks(self, rows: Rows, columns: Rows) -> Array:
+        """What pairs of a source and a target point, by their rows, say for a transform that lays them together."""
         score = self.score[rows, columns].astype(np.float64)
         by_row = score - self.row[rows] + np.log(self.score.shape[1])
         by_column = score - self.column[columns] + np.log(self.score.shape[0])
-        return float(np.minimum(by_row, by_column).clip(AGAINST, FOR).sum() / min(self.score.shape))
+        return np.asarray(np.minimum(by_row, by_column).clip(AGAINST, FOR))
 
 
 def mutual_matches(score: Scores, row: Scores, column: Scores) -> tuple[Rows, Rows]:

@@ -31,6 +31,8 @@ UNLIKELY = 0.05
 VIOLATION, MOST_VIOLATION = 0.002, 0.02
 """Share of points where the other scan saw through that halves a score; and the most that counts, since scans of
 moving objects and bleeding edges have some in the right pose."""
+PROMISING = 0.3
+"""Share of the greatest likelihood from which on a transform is refined."""
 MIXED = 2.0
 """How fast the score of sparse clouds' answers falls with :func:`idam.search.sparse.border.mixing`. The features of
 dense clouds say enough, and what a scanner sees of them does not end at a plane."""
@@ -111,8 +113,10 @@ def likeliest(transformations: Array, matching: Matching, most: int) -> Array:
 
     Next to refining an answer, to ask for its likelihood costs nothing; and to refine more of them gains nothing.
     """
-    likelihood = np.array([matching.likelihood(transformation) for transformation in transformations])
-    return transformations[np.argsort(-likelihood, kind="stable")[:most]]
+    likelihood = matching.likelihoods(transformations)
+    order = np.argsort(-likelihood, kind="stable")[:most]
+    best = likelihood[order[0]]
+    return transformations[order[likelihood[order] >= min(best, PROMISING * best)]]
 
 
 def ranked(answers: Iterable[Answer]) -> list[Answer]:
