@@ -62,10 +62,12 @@ class Found:
     Attributes:
         answers: the one to give first, and then those that are not like it, the best first.
         matching: of the clouds that they were scored on.
+        slides: whether what the best one lays on each other may slide along itself.
     """
 
     answers: list[Answer]
     matching: Matching
+    slides: bool = False
 
     @property
     def best(self) -> Array:
@@ -107,7 +109,7 @@ def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, sco
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
         )
-        if sure >= SURE:
+        if sure >= SURE and not (found.slides and level is clouds.small and not clouds.all_small):
             return found
         candidates = np.array([answer.transformation for answer in found.answers])
     if network is None:
@@ -152,7 +154,8 @@ def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fi
         slid = likeliest(mistaken, matching, SLID)
         answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
-    return Found(smallest_rotation(judged(answers[:CONTENDERS], matching, method, fine), scope.guess), matching)
+    answers = smallest_rotation(judged(answers[:CONTENDERS], matching, method, fine), scope.guess)
+    return Found(answers, matching, slides=len(mistaken) > 0)
 
 
 def homed(guess: Array, matching: Matching) -> Array:
@@ -177,7 +180,6 @@ def to_match(clouds: Pyramid) -> Iterator[tuple[PairLevel, int]]:
     """Clouds, and from how many of their matches to grow sets of agreeing ones."""
     if not clouds.all_small:
         yield clouds.small, SEEDS[0]
-        yield clouds.with_points(1024), SEEDS[0]
     yield clouds.larger, SEEDS[1]
 
 
