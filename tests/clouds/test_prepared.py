@@ -91,8 +91,9 @@ def test_same_bits_in_whatever_order_levels_are_asked_for() -> None:
 
 
 def test_levels_are_those_of_the_centred_points(cloud: Prepared) -> None:
-    size = cloud.voxel_size(SMALL)
-    np.testing.assert_array_equal(cloud.level(size).points, downsample(cloud.points - cloud.centre, size))
+    fine, small = cloud.voxel_size(FINE), cloud.voxel_size(SMALL)
+    np.testing.assert_array_equal(cloud.level(fine).points, downsample(cloud.points - cloud.centre, fine))
+    np.testing.assert_array_equal(cloud.level(small).points, downsample(cloud.level(fine).points, small))
 
 
 def test_what_is_kept_of_a_large_cloud_bounds_every_level() -> None:

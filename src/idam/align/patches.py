@@ -137,7 +137,9 @@ class Pairs:
 
     @cached_property
     def scale(self) -> float:
-        """The robust standard deviation of the residuals."""
+        """The robust standard deviation of the residuals; infinite where there are none."""
+        if len(self.points) == 0:
+            return float("inf")
         return 1.4826 * float(np.median(np.abs(self.residuals)))
 
     @cached_property

@@ -92,7 +92,8 @@ class Matching:
         source, target = self.clouds.surfaces.source, self.clouds.surfaces.target
         some = np.arange(0, len(source.points), len(source.points) // SOME + 1)
         moved = rigid.apply(transformations, source.points[some])
-        distance, nearest = (x.reshape(len(transformations), -1) for x in target.nearest(moved.reshape(-1, 3)))
+        distance, nearest = target.nearest(moved.reshape(-1, 3))
+        distance, nearest = distance.reshape(moved.shape[:2]), nearest.reshape(moved.shape[:2])
         normals = source.normals[some] @ transformations[:, :3, :3].swapaxes(1, 2)
         cosine = np.einsum("smd,smd->sm", normals, target.normals[nearest])
         on = (distance <= TOUCHING * self.clouds.spacing) & (np.abs(cosine) >= SAME_SURFACE)

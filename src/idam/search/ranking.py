@@ -31,8 +31,9 @@ UNLIKELY = 0.05
 VIOLATION, MOST_VIOLATION = 0.002, 0.02
 """Share of points where the other scan saw through that halves a score; and the most that counts, since scans of
 moving objects and bleeding edges have some in the right pose."""
-PROMISING = 0.3
-"""Share of the greatest likelihood from which on a transform is refined."""
+PROMISING, SLIGHT = 0.3, 0.02
+"""Share of the greatest likelihood from which on a transform is refined; and what makes no difference, about as much as
+the overlap of answers that nothing speaks for."""
 MIXED = 2.0
 """How fast the score of sparse clouds' answers falls with :func:`idam.search.sparse.border.mixing`. The features of
 dense clouds say enough, and what a scanner sees of them does not end at a plane."""
@@ -116,7 +117,8 @@ def likeliest(transformations: Array, matching: Matching, most: int) -> Array:
     likelihood = matching.likelihoods(transformations)
     order = np.argsort(-likelihood, kind="stable")[:most]
     best = likelihood[order[0]]
-    return transformations[order[likelihood[order] >= min(best, PROMISING * best)]]
+    promising = likelihood[order] >= min(best, PROMISING * best) - SLIGHT
+    return np.asarray(transformations[order[promising]])
 
 
 def ranked(answers: Iterable[Answer]) -> list[Answer]:

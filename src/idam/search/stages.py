@@ -29,8 +29,9 @@ log = logging.getLogger(__name__)
 Network = Callable[[Array], Array]
 """A network of the paper's kind: from a guess (4, 4) in working coordinates to its answer (4, 4)."""
 
-SEEDS = 200, 600
-"""Matches that sets of agreeing ones are grown from, on the small clouds and on the larger ones."""
+SEEDS, SPARSE_SEEDS = 200, 600
+"""Matches that sets of agreeing ones are grown from. With 600 as many answers of 108 ray-cast pairs are right, and it
+takes longer; of sparse clouds, fewer miss some of a symmetric object's poses."""
 HYPOTHESES = 64
 """Different transforms, among those that the sets agree on, whose likelihood is asked for."""
 EXAMINED = 8
@@ -101,15 +102,16 @@ def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, sco
         method: of refinement, or ``none``.
     """
     candidates = scope.guess[None]
-    for level, seeds in to_match(clouds):
+    for level in to_match(clouds):
         matching = Matching.of(descriptor, level)
-        agreed = scope.within(agreeing_transforms(matching.matches, seeds))
+        agreed = scope.within(agreeing_transforms(matching.matches, SPARSE_SEEDS if clouds.sparse else SEEDS))
         found = explain(np.concatenate([candidates, agreed]), matching, scope, method, clouds.fine.surfaces)
         sure = confidence(found.evidence)
         log.info(
             "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
         )
-        if sure >= SURE and not (found.slides and level is clouds.small and not clouds.all_small):
+        few = level is clouds.small and not clouds.all_small
+        if sure >= SURE and not (found.slides and few):  # what slides can look settled by few points
             return found
         candidates = np.array([answer.transformation for answer in found.answers])
     if network is None:
@@ -176,11 +178,11 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
     return first_of_its_kind([*sorted(contenders, key=lambda answer: -weight(answer)), *rest])
 
 
-def to_match(clouds: Pyramid) -> Iterator[tuple[PairLevel, int]]:
-    """Clouds, and from how many of their matches to grow sets of agreeing ones."""
+def to_match(clouds: Pyramid) -> Iterator[PairLevel]:
+    """The clouds to match, the smallest first."""
     if not clouds.all_small:
-        yield clouds.small, SEEDS[0]
-    yield clouds.larger, SEEDS[1]
+        yield clouds.small
+    yield clouds.larger
 
 
 def first_of_its_kind(answers: list[Answer]) -> list[Answer]:
