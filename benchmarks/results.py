@@ -179,7 +179,7 @@ def efficiency(record: dict[str, Any]) -> str:
     about = (
         f"- `{record['command']}`: {record['date'][:10]}, {record['processor']}, {record['threads']} threads, no GPU."
     )
-    return "\n".join([*lines, "", about])
+    return "\n".join([*lines, "", "![Time of every method by size](images/speed.png)", "", about])
 
 
 def milliseconds(median: float, quartiles: Sequence[float] | None) -> str:
