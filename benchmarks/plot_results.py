@@ -1,4 +1,4 @@
-"""Pictures of the tables: the errors of each row in the paper's experiments, and recall on pairs closer to practice.
+"""Pictures of the tables: errors in the paper's experiments, recall on pairs closer to practice, and times by size.
 
 python benchmarks/plot_results.py docs/images docs/results/*.json
 """
@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 
 from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.table import order, short_name
+from idam.lab.figures.plot_curves import draw_timings
+from idam.lab.figures.timings import read_timings
 from idam.report.style import BLUE, ORANGE, VERMILLION, look, save
 
 ERRORS = {
@@ -104,6 +106,10 @@ def main() -> None:
         if titles.keys() <= rows.keys():
             with look():
                 print(*save(draw(rows), arguments.folder / name))
+    for path in arguments.records:
+        if "median_ms" in json.loads(path.read_text()):
+            with look():
+                print(*save(draw_timings(read_timings(path)), arguments.folder / "speed"))
 
 
 if __name__ == "__main__":

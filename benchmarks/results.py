@@ -17,6 +17,7 @@ import scans
 from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.runner import Row
 from idam.lab.evaluation.table import columns, order, short_name
+from idam.lab.figures.timings import growth
 
 TITLES = {
     "unseen-shapes": "Unseen shapes (section 4.1)",
@@ -161,13 +162,29 @@ def origin(record: dict[str, Any]) -> str:
 
 
 def efficiency(record: dict[str, Any]) -> str:
-    """Milliseconds of each method at each number of points."""
+    """Milliseconds of each method at each number of points, how they grow, and those of pairs in a batch."""
     times: dict[str, dict[str, float]] = record["median_ms"]
-    lines = ["## Efficiency (section 4.5)", "", line(["ms, median", *times]), line(["---"] * (len(times) + 1))]
-    lines += [
-        line([name, *(f"{column[name]:.0f}" for column in times.values())]) for name in next(iter(times.values()))
-    ]
-    return "\n".join([*lines, "", f"- `{record['command']}`: {record['date'][:10]}, {record['processor']}."])
+    spread, batched = record.get("quartiles_ms", {}), record.get("batched", {})
+    heads = ["ms, median (quartiles)", *times, "grows with points to the"]
+    heads += [f"{batched['pairs']} pairs of {batched['points']} at once, a pair"] if batched else []
+    lines = ["## Efficiency (section 4.5)", "", line(heads), line(["---"] * len(heads))]
+    for name in next(iter(times.values())):
+        cells = [milliseconds(column[name], spread.get(points, {}).get(name)) for points, column in times.items()]
+        exponent = growth({int(points): column[name] for points, column in times.items()})
+        cells.append("" if exponent is None else f"{exponent:.2f}")
+        if batched:
+            found = name in batched["median_ms"]
+            cells.append(milliseconds(batched["median_ms"][name], batched["quartiles_ms"][name]) if found else "")
+        lines.append(line([name, *cells]))
+    about = (
+        f"- `{record['command']}`: {record['date'][:10]}, {record['processor']}, {record['threads']} threads, no GPU."
+    )
+    return "\n".join([*lines, "", "![Time of every method by size](images/speed.png)", "", about])
+
+
+def milliseconds(median: float, quartiles: Sequence[float] | None) -> str:
+    """A median, and between which times the middle half was."""
+    return f"{median:.0f}" if quartiles is None else f"{median:.0f} ({quartiles[0]:.0f} to {quartiles[1]:.0f})"
 
 
 def real_scans(record: dict[str, Any]) -> str:

@@ -10,6 +10,21 @@ from torch.testing import assert_close
 
 from idam.network.layers import NormalisedLinear
 
+__all__ = [
+    "_same_weights_every_time",
+    "assert_rotations",
+    "close",
+    "dtype",
+    "generator",
+    "linear_norm_relu",
+    "one_thread",
+    "rand",
+    "randn",
+    "same_gradients",
+    "seasoned",
+]
+"""The fixtures, which the conftest.py of each folder that needs them imports all at once."""
+
 TOLERANCE = {torch.float32: {"rtol": 1e-5, "atol": 1e-5}, torch.float64: {"rtol": 1e-10, "atol": 1e-10}}
 
 

@@ -19,7 +19,7 @@ from idam.lab.figures import draw, draw_figures
 from idam.lab.figures.categories import category_names, one_of_each, spread, up_axis
 from idam.lab.figures.curves import calibrate, iteration_errors, observe, right_matches
 from idam.lab.figures.scenes import Kept, Matches, Overlay, first_matches, kept_points, lay, read_scans
-from idam.lab.figures.timings import Timings, read_timings
+from idam.lab.figures.timings import Timings, growth, read_timings
 from idam.network.config import Config
 from idam.network.geometry import apply_transform, nearest, rotation_angle, weighted_procrustes
 from idam.network.model import IDAM, Output
@@ -272,6 +272,17 @@ def test_times_are_read_by_method_from_the_slowest_on(write):
     assert list(timings.milliseconds["slow"]) == [1024, 4096]
 
 
+def test_quartiles_are_read_where_there_are_any(write):
+    record = {"threads": 2, "median_ms": TIMES, "quartiles_ms": {"1024": {"quick": [9, 12.5]}}}
+    assert read_timings(write(record)).quartiles == {"quick": {1024: (9, 12.5)}}
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.5])
+def test_growth_is_the_exponent_of_a_power_law(exponent):
+    assert growth({points: 3 * points**exponent for points in (512, 1024, 4096)}) == pytest.approx(exponent)
+    assert growth({1024: 10.0}) is None
+
+
 BAD_TIMES = {
     "no JSON": "1024 points: fast",
     "another record": {"rows": []},
@@ -284,6 +295,7 @@ BAD_TIMES = {
     "no time at all": {"threads": 2, "median_ms": {"1024": {"quick": 0}}},
     "not a number": {"threads": 2, "median_ms": {"1024": {"quick": float("nan")}}},
     "a list of times": {"threads": 2, "median_ms": {"1024": [1, 2]}},
+    "one quartile": {"threads": 2, "median_ms": TIMES, "quartiles_ms": {"1024": {"quick": [1]}}},
 }
 
 
@@ -378,6 +390,9 @@ FIGURES = {
     "iterations": lambda randn: draw_iterations(10 ** (1 - randn(50, 21).abs())),
     "a calibration": lambda randn: draw_calibration(calibrate(randn(500).sigmoid(), randn(500) > 0)),
     "many times": lambda _: draw_timings(Timings(2, MANY_TIMES)),
+    "times and quartiles": lambda _: draw_timings(
+        Timings(2, MANY_TIMES, {"network gnn-gaussian-noise 0": {1024: (9.0, 12.0)}})
+    ),
     "a single time": lambda _: draw_timings(Timings(1, {"network": {1024: 10.0}})),
 }
 

@@ -43,12 +43,6 @@ def direct_gnn(linear_norm_relu):
     return run
 
 
-@pytest.fixture(autouse=True)
-def few_points_at_a_time(monkeypatch) -> None:
-    """In evaluation, parts of 60 points, the last one smaller."""
-    monkeypatch.setattr("idam.network.features.gnn.POINTS_IN_CACHE", 17)
-
-
 @MODES
 def test_the_gnn_is_its_formula(train, seasoned, points, direct_gnn, dtype, close):
     gnn, points = seasoned(GNN(neighbours=5), dtype, train=train), points.to(dtype)

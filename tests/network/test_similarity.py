@@ -52,14 +52,6 @@ def test_the_convolution_is_its_definition(train, seasoned, clouds, direct, dtyp
     close(score, expected_score)
 
 
-def test_rows_a_few_at_a_time_are_rows_all_at_once(seasoned, clouds, close, monkeypatch):
-    module = seasoned(SimilarityConvolution(10, 8), clouds[0].dtype)
-    together = module(*clouds)
-    monkeypatch.setattr("idam.network.similarity.PAIRS_IN_CACHE", 40)
-    for rows, expected in zip(module(*clouds), together, strict=True):
-        close(rows, expected)
-
-
 @MODES
 def test_its_gradient_is_that_of_its_definition(train, seasoned, clouds, direct, same_gradients):
     module, clouds = seasoned(SimilarityConvolution(10, 8), train=train), [x.double() for x in clouds]
@@ -80,9 +72,10 @@ class LargestTensor(TorchDispatchMode):
 
 
 @MODES
-def test_the_tensor_of_all_channels_is_never_built(train, seasoned, randn):
+@pytest.mark.parametrize("gradients", [False, True])
+def test_the_tensor_of_all_channels_is_never_built(train, gradients, seasoned, randn):
     module = seasoned(SimilarityConvolution(500, 8), train=train)
-    with LargestTensor() as largest:
+    with torch.set_grad_enabled(gradients), LargestTensor() as largest:
         module(randn(1, 90, 3), randn(1, 80, 3), randn(1, 90, 500), randn(1, 80, 500))
     assert largest.elements == 90 * 80 * 8
 

@@ -26,8 +26,10 @@ class NormalisedLinear(nn.Module):
 
     def projection(self) -> tuple[Tensor, Tensor | None]:
         """Weight (out, in) and bias (out,) to apply; the bias is None in training, where the norm comes after."""
-        if self.training:
-            return self.linear.weight, None
+        return (self.linear.weight, None) if self.training else self.folded()
+
+    def folded(self) -> tuple[Tensor, Tensor]:
+        """Weight (out, in) and bias (out,) of the linear map and the normalisation by running statistics as one."""
         assert self.norm.running_var is not None and self.norm.running_mean is not None
         scale = self.norm.weight * torch.rsqrt(self.norm.running_var + self.norm.eps)
         return self.linear.weight * scale.unsqueeze(1), self.norm.bias - self.norm.running_mean * scale

@@ -6,7 +6,7 @@ For every pair of a source point p_i and a target point q_j, the vector (equatio
 
 goes through 1x1 convolutions to pair features F(i, j), and these to one score; a softmax over each row of scores is
 the similarity matrix. The first convolution is a linear map of a concatenation, hence the sum of one map for each
-part: T is never built.
+part: T is never built. :mod:`idam.network.inference` does the same in less time where no gradient is asked for.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from idam.network.inference import score_pairs, takes_plain_operations
 from idam.network.layers import NormalisedLinear
 
 __all__ = ["SimilarityConvolution", "pair_geometry"]
-
-PAIRS_IN_CACHE = 16384
-"""Pairs that go through the convolutions at once in evaluation: their features, 2 MB, stay near the cores."""
 
 
 def pair_geometry(source: Tensor, target: Tensor) -> Tensor:
@@ -54,16 +52,12 @@ class SimilarityConvolution(nn.Module):
             source_features: (B, M, K).
             target_features: (B, L, K).
         """
-        # a few rows at a time stay in the cache; in training the normalisation needs all pairs at once
-        rows = source.shape[1] if self.training else max(1, PAIRS_IN_CACHE // (len(source) * target.shape[1]))
-        maxima, scores = [], []
-        for some, some_features in zip(
-            torch.split(source, rows, 1), torch.split(source_features, rows, 1), strict=True
-        ):
-            pairs = self.pair_features(some, target, some_features, target_features)
-            maxima.append(pairs.amax(2))
-            scores.append(self.score(pairs).squeeze(-1))
-        return torch.cat(maxima, 1), torch.cat(scores, 1)
+        clouds = source, target, source_features, target_features
+        if takes_plain_operations(self, *clouds):
+            pairs = self.pair_features(*clouds)
+            return pairs.amax(2), self.score(pairs).squeeze(-1)
+        layers = [layer.folded() for layer in (self.first, *self.hidden)]
+        return score_pairs([*layers, (self.score.weight, self.score.bias)], *clouds)
 
     def pair_features(self, source: Tensor, target: Tensor, source_features: Tensor, target_features: Tensor) -> Tensor:
         """F(i, j), (B, M, L, channels), of every pair; the arguments are those of :meth:`forward`."""

@@ -73,7 +73,7 @@ def test_the_weights_are_read_once_and_not_for_every_pair(weights, clouds):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_without_a_model_the_network_has_the_weights_for_unseen_shapes(name, monkeypatch):
     asked = []
-    monkeypatch.setattr(network, "load_model", lambda model: (asked.append(model), IDAM(Config(NETWORKS[name])))[1])
+    monkeypatch.setattr(network, "load_model", lambda model, _: (asked.append(model), IDAM(Config(NETWORKS[name])))[1])
     build_method(name)
     build_method(name, "another")
     assert asked == [f"{NETWORKS[name]}-unseen-shapes", "another"]
@@ -112,7 +112,7 @@ def test_the_paper_s_inference_is_a_row_whatever_the_model_s_own(tmp_path, seaso
     used = []
     config = Config(neighbours=5, channels=8, keep=1 / 2, iterations=7, keep_again=(1.0,), soft_matches=True)
     save_model(tmp_path / "own.safetensors", seasoned(IDAM(config), torch.float32), {})
-    monkeypatch.setattr(network, "load_model", lambda name: (used.append(load_model(name)), used[-1])[1])
+    monkeypatch.setattr(network, "load_model", lambda *given: (used.append(load_model(*given)), used[-1])[1])
     build_method("gnn-idam-paper", str(tmp_path / "own.safetensors"))
     paper = Config(neighbours=5, channels=8)
     assert used[0].config == paper

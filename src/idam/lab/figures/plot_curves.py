@@ -7,7 +7,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from idam.lab.figures.curves import Calibration
-from idam.lab.figures.timings import Timings
+from idam.lab.figures.timings import Timings, growth
 from idam.report.style import BLUE, COLUMN, GREY, ORANGE, PAGE, PALETTE
 
 __all__ = ["draw_calibration", "draw_iterations", "draw_timings"]
@@ -56,14 +56,18 @@ def draw_calibration(calibration: Calibration) -> Figure:
 
 
 def draw_timings(timings: Timings) -> Figure:
-    """Milliseconds by points, one line for each method; the legend is in the order of the lines."""
+    """Milliseconds by points, with quartiles, and how fast they grow; the legend is in the order of the lines."""
     figure = Figure((PAGE, max(2.6, 0.2 + 0.18 * len(timings.milliseconds))), layout="constrained")
     axes = figure.subplots()
     for n, (method, times) in enumerate(timings.milliseconds.items()):
         colour, marker = PALETTE[n % len(PALETTE)], MARKERS[n % len(MARKERS)]
         style = ("-", "--", ":")[n // len(PALETTE) % 3]
         sizes, milliseconds = list(times), list(times.values())
-        axes.plot(sizes, milliseconds, style, color=colour, marker=marker, markersize=4, label=method)
+        exponent = growth(times)
+        label = method if exponent is None else f"{method}, n^{exponent:.1f}"
+        axes.plot(sizes, milliseconds, style, color=colour, marker=marker, markersize=4, label=label)
+        for points, spread in timings.quartiles.get(method, {}).items():
+            axes.plot([points, points], spread, color=colour, linewidth=2.5, alpha=0.4, solid_capstyle="butt")
     axes.set_xscale("log")
     axes.set_yscale("log")
     every = sorted({points for times in timings.milliseconds.values() for points in times})

@@ -8,7 +8,7 @@ Most of the network's time and memory goes into the (points x neighbours) edges,
 can be: neighbours come first in memory, (K, P, C), which makes the maximum an elementwise one over K slabs; the first
 layer of g, being linear, is applied to the points and not to their differences; and the ReLU of g, being monotonic,
 comes after the maximum. The two autograd functions are the plain operations with a backward pass that does not
-scatter.
+scatter. Without gradients, :mod:`idam.network.inference` needs fewer passes still.
 """
 
 from __future__ import annotations
@@ -22,12 +22,10 @@ from torch import Tensor, nn
 
 from idam.describe.neighbours import nearest_neighbours as nearest_by_tree
 from idam.network.geometry import nearest_neighbours
+from idam.network.inference import largest_messages, takes_plain_operations
 from idam.network.layers import NormalisedLinear
 
 __all__ = ["GNN", "EdgeLayer", "neighbour_graph", "neighbours_of"]
-
-POINTS_IN_CACHE = 256
-"""Points whose edges go through a layer at once in evaluation: their features, 0.8 MB, stay near the core."""
 
 
 def neighbour_graph(points: Tensor, k: int) -> Tensor:
@@ -130,16 +128,14 @@ class EdgeLayer(nn.Module):
         with torch.autocast(u.device.type, enabled=False):
             h = F.linear(u, weight.to(u.dtype))
         centre = h if bias is None else h + bias
-        # some points at a time stay in the cache; in training the normalisation needs all edges at once
-        points = len(u) if self.training else POINTS_IN_CACHE
-        parts = zip(torch.split(centre, points), torch.split(neighbours, points, 1), strict=True)
-        updated: Tensor = self.update(F.relu(torch.cat([self._gather(some, h, near) for some, near in parts])))
+        if takes_plain_operations(self, u):
+            edges = self.first.finish(neighbour_difference(centre, h, neighbours))
+            messages = self.second.normalise(F.linear(edges, *self.second.projection()))
+            largest = neighbour_maximum(messages)
+        else:
+            largest = largest_messages(centre, h, neighbours, self.second.folded())
+        updated: Tensor = self.update(F.relu(largest))
         return updated
-
-    def _gather(self, centre: Tensor, h: Tensor, neighbours: Tensor) -> Tensor:
-        """Largest of the messages before the ReLU, (P, out): of (P, out), from rows (K, P) of h (Q, out)."""
-        edges = self.first.finish(neighbour_difference(centre, h, neighbours))
-        return neighbour_maximum(self.second.normalise(F.linear(edges, *self.second.projection())))
 
 
 class GNN(nn.Module):

@@ -11,11 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from idam import rigid
 from idam.align import align, reaches
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.errors import InputError
 from idam.lab.evaluation.methods import Method
 from idam.lab.settings import with_settings
+from idam.network.model import IDAM
 from idam.network.pretrained import load_model
 from idam.weights import list_models
 
@@ -27,6 +29,7 @@ __all__ = [
     "fpfh",
     "gnn",
     "gnn_then_icp",
+    "load_network",
     "weights_for",
 ]
 
@@ -106,28 +109,42 @@ def weights_for(method: str, experiment: str | None) -> str | None:
 
 
 def _alone(features: str, model: str, settings: Sequence[str]) -> Method:
-    network = load_model(model)
+    return as_method(load_network(features, model, settings))
+
+
+def load_network(features: str, model: str, settings: Sequence[str], device: str | None = None) -> IDAM:
+    """The network of a row.
+
+    Args:
+        features: that it must have.
+        model: name or file of the weights.
+        settings: of the inference, each ``NAME=VALUE``.
+        device: where to put it; the CPU if None.
+
+    Raises:
+        InputError: the weights, a setting or the device cannot be used, or the network has other features.
+    """
+    network = load_model(model, device)
     if network.config.features != features:
         raise InputError(
             f"{model} has {network.config.features} features, which this method is not about: give --model a network "
             f"of {features} features, or use --method register"
         )
     network.config = with_settings(network.config, settings, INFERENCE)
-    return as_method(network)
+    return network
 
 
 def as_method(network: nn.Module) -> Method:
     """A network whose output for (1, N, 3) and (1, M, 3) has a rotation and a translation, as a method."""
+    device = next(network.parameters()).device
 
     @torch.inference_mode()
     def run(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.float64]:
         try:
-            output = network(torch.from_numpy(source)[None], torch.from_numpy(target)[None])
+            output = network(*(torch.from_numpy(cloud)[None].to(device) for cloud in (source, target)))
         except ValueError as error:  # clouds with too few points for the features
             raise InputError(str(error)) from None
-        transformation = np.eye(4)
-        transformation[:3, :3] = output.rotation[0].numpy()
-        transformation[:3, 3] = output.translation[0].numpy()
-        return transformation
+        rotation = rigid.nearest_rotation(output.rotation[0].double().cpu().numpy())
+        return rigid.transform(rotation, output.translation[0].double().cpu().numpy())
 
     return run
