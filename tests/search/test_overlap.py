@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from idam.clouds.surfaces import SAME_SURFACE, TOUCHING, Surface, Surfaces
-from idam.search.overlap import exactness, overlap, shares
+from idam.search.overlap import exactness, shares
 from motions import move, rigid
 from solids import distances, shell
 
@@ -16,6 +18,11 @@ SPACING = 0.06
 
 def pair(source: np.ndarray, target: np.ndarray) -> Surfaces:
     return Surfaces(Surface.of(source), Surface.of(target), SPACING)
+
+
+def overlap(surfaces: Surfaces, matrix: np.ndarray) -> float:
+    """The geometric mean of both shares."""
+    return float(np.prod(shares(surfaces, matrix)) ** 0.5)
 
 
 @pytest.fixture
@@ -41,11 +48,11 @@ def test_is_that_of_brute_force(overlapping: Surfaces, matrix: np.ndarray) -> No
     source, target = overlapping.source, overlapping.target
     distance = distances(move(matrix, source.points), target.points)
     alike = np.abs(source.normals @ matrix[:3, :3].T @ target.normals.T) >= SAME_SURFACE
-    shares = [
+    expected = [
         ((d.min(1) <= TOUCHING * SPACING) & a[np.arange(len(d)), d.argmin(1)]).mean()
         for d, a in ((distance, alike), (distance.T, alike.T))
     ]
-    assert overlap(overlapping, matrix) == pytest.approx(np.sqrt(np.prod(shares)), abs=1e-12)
+    assert overlap(overlapping, matrix) == pytest.approx(np.sqrt(np.prod(expected)), abs=1e-12)
 
 
 def test_swapping_the_clouds_changes_nothing(overlapping: Surfaces) -> None:
@@ -57,7 +64,7 @@ def test_swapping_the_clouds_changes_nothing(overlapping: Surfaces) -> None:
 def test_is_the_mean_of_the_shares_of_points_in_the_overlap() -> None:
     points = shell(500, 1)
     # normals of the parts differ at their borders, where points of both are few
-    found = overlap(pair(points[:400], points[300:]), np.eye(4), reach=1e-6)
+    found = overlap(replace(pair(points[:400], points[300:]), spacing=1e-8), np.eye(4))
     assert found == pytest.approx((100 / 400 * 100 / 200) ** 0.5, rel=0.15)
 
 
@@ -71,9 +78,9 @@ def test_falls_as_the_clouds_part() -> None:
 def test_surfaces_that_cross_do_not_overlap() -> None:
     random = np.random.default_rng(0)
     plane, other = (random.uniform(-1, 1, size=(800, 3)) * [1, 1, 0] for _ in range(2))
-    clouds = pair(plane, move(POSE, other))
-    assert overlap(clouds, POSE, reach=4.0) > 0.98
-    assert overlap(clouds, POSE @ rigid([np.pi / 2, 0, 0], [0, 0, 0]), reach=4.0) < 0.1
+    clouds = replace(pair(plane, move(POSE, other)), spacing=2.7 * SPACING)
+    assert overlap(clouds, POSE) > 0.98
+    assert overlap(clouds, POSE @ rigid([np.pi / 2, 0, 0], [0, 0, 0])) < 0.1
 
 
 # --- the shares ----------------------------------------------------------------------------------------------------
@@ -85,14 +92,13 @@ def test_shares_are_those_of_brute_force_point_by_point(overlapping: Surfaces) -
         for point, normal in zip(move(matrix, own.points), own.normals @ matrix[:3, :3].T, strict=True):
             distance = np.linalg.norm(other.points - point, axis=1)
             near = int(distance.argmin())
-            lie += distance[near] <= 2.0 * SPACING and abs(normal @ other.normals[near]) >= SAME_SURFACE
+            lie += distance[near] <= TOUCHING * SPACING and abs(normal @ other.normals[near]) >= SAME_SURFACE
         return lie / len(own.points)
 
-    mine, theirs = shares(overlapping, POSE, 2.0)
+    mine, theirs = shares(overlapping, POSE)
     assert mine == share(overlapping.source, overlapping.target, POSE)
     assert theirs == share(overlapping.target, overlapping.source, np.linalg.inv(POSE))
     assert mine != theirs
-    assert overlap(overlapping, POSE, 2.0) == pytest.approx((mine * theirs) ** 0.5, abs=1e-12)
 
 
 def test_shares_swap_with_the_clouds(overlapping: Surfaces) -> None:

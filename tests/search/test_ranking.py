@@ -11,7 +11,7 @@ from idam.align import align, reaches
 from idam.clouds.surfaces import TOUCHING, Surface, Surfaces, spacing_of
 from idam.clouds.viewpoint import DepthMap, FreeSpace
 from idam.search.matching import FEW, FeatureMatches, Matching
-from idam.search.overlap import exactness, overlap, shares
+from idam.search.overlap import exactness, shares
 from idam.search.ranking import (
     MOST_VIOLATION,
     UNLIKELY,
@@ -147,7 +147,7 @@ def test_improve_without_refinement_only_scores(matching: Matching) -> None:
         assert (answer.transformation == start).all()
         assert answer.support == matching.matches.support(start)
         assert answer.likelihood == matching.likelihood(start)
-        assert answer.overlap == pytest.approx(overlap(surfaces, start), abs=1e-12)
+        assert answer.overlap == pytest.approx(np.prod(shares(surfaces, start)) ** 0.5, abs=1e-12)
         assert answer.contained == max(shares(surfaces, start))
         # what nobody has looked at yet speaks against it
         assert (answer.close, answer.off, answer.violation) == (0.0, 1.0, 0.0)

@@ -8,23 +8,17 @@ from idam import rigid
 from idam.clouds.surfaces import TOUCHING, Surfaces
 from idam.rigid import Array
 
-__all__ = ["exactness", "overlap", "shares"]
+__all__ = ["exactness", "shares"]
 
 
-def shares(surfaces: Surfaces, transformation: Array, reach: float = TOUCHING) -> tuple[float, float]:
+def shares(surfaces: Surfaces, transformation: Array) -> tuple[float, float]:
     """The shares of the source's and of the target's points that lie on the other cloud, in [0, 1].
 
-    A point lies on the nearest one of the other cloud, within ``reach`` spacings, where their normals agree.
+    A point lies on the nearest one of the other cloud, where they touch and their normals agree.
     """
-    mine, _ = surfaces.alike(transformation, reach)
-    theirs, _ = surfaces.swapped.alike(rigid.inverse(transformation), reach)
+    mine, _ = surfaces.alike(transformation)
+    theirs, _ = surfaces.swapped.alike(rigid.inverse(transformation))
     return len(mine) / len(surfaces.source.points), len(theirs) / len(surfaces.target.points)
-
-
-def overlap(surfaces: Surfaces, transformation: Array, reach: float = TOUCHING) -> float:
-    """The geometric mean of both shares, which is high only where both clouds are explained."""
-    mine, theirs = shares(surfaces, transformation, reach)
-    return float((mine * theirs) ** 0.5)
 
 
 def exactness(surfaces: Surfaces, transformation: Array, reach: float) -> tuple[float, float]:

@@ -32,25 +32,17 @@ def slippage(surfaces: Surfaces, transformation: Array) -> tuple[Array, Array, A
         (6,); the motions as twists of the target's frame about the centre, (6, 6); and the centre (3,). Nothing where
         fewer than six points lie on each other.
     """
-    mine, theirs = surfaces.alike(transformation)
-    if len(mine) < 6:
-        return np.empty(0), np.empty((0, 6)), np.zeros(3)
-    points = rigid.apply(transformation, surfaces.source.points[mine])
-    normals = surfaces.target.normals[theirs]
-    centre = points.mean(0)
-    radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
-    along = np.concatenate([np.cross((points - centre) / radius, normals), normals], 1)
-    share, motions = np.linalg.eigh(along.T @ along / len(mine))
-    return share, motions.T / np.array([radius, radius, radius, 1.0, 1.0, 1.0]), centre
+    return _slippage(*_shared(surfaces, transformation))
 
 
 def slides(surfaces: Surfaces, transformation: Array) -> Array:
     """Poses (S, 4, 4) that lay the common surface of a pose (4, 4) on itself, nearly; none where it does not slide."""
-    share, motions, centre = slippage(surfaces, transformation)
+    points, normals = _shared(surfaces, transformation)
+    share, motions, centre = _slippage(points, normals)
     motions = motions[share < SLIPPABLE]
     if len(motions) == 0:
         return np.empty((0, 4, 4))
-    starts = np.concatenate([transformation[None], _half_turns(surfaces, transformation) @ transformation])
+    starts = np.concatenate([transformation[None], _half_turns(points) @ transformation])
     there, back = rigid.transform(np.eye(3), centre), rigid.transform(np.eye(3), -centre)
     slid = [starts[1:]]
     for motion in motions:
@@ -62,11 +54,26 @@ def slides(surfaces: Surfaces, transformation: Array) -> Array:
     return np.concatenate(slid)
 
 
-def _half_turns(surfaces: Surfaces, transformation: Array) -> Array:
-    """Half turns (3, 4, 4) of the target's frame about the principal axes of what the clouds share."""
-    mine, _ = surfaces.alike(transformation)
-    points = rigid.apply(transformation, surfaces.source.points[mine])
+def _half_turns(points: Array) -> Array:
+    """Half turns (3, 4, 4) about the principal axes of points (N, 3)."""
     centre = points.mean(0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2]
     turns = rigid.transform(2 * axes[:, :, None] * axes[:, None, :] - np.eye(3), np.zeros(3))
     return rigid.transform(np.eye(3), centre) @ turns @ rigid.transform(np.eye(3), -centre)
+
+
+def _shared(surfaces: Surfaces, transformation: Array) -> tuple[Array, Array]:
+    """Points (C, 3) that a pose lays on the target, in its frame, and the target's normals there (C, 3)."""
+    mine, theirs = surfaces.alike(transformation)
+    return rigid.apply(transformation, surfaces.source.points[mine]), surfaces.target.normals[theirs]
+
+
+def _slippage(points: Array, normals: Array) -> tuple[Array, Array, Array]:
+    """:func:`slippage` of a surface's points and normals, (C, 3)."""
+    if len(points) < 6:
+        return np.empty(0), np.empty((0, 6)), np.zeros(3)
+    centre = points.mean(0)
+    radius = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
+    along = np.concatenate([np.cross((points - centre) / radius, normals), normals], 1)
+    share, motions = np.linalg.eigh(along.T @ along / len(points))
+    return share, motions.T / np.array([radius, radius, radius, 1.0, 1.0, 1.0]), centre
