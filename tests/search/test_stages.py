@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from idam.clouds.prepared import Prepared
+from idam.clouds.prepared import FINE, Prepared
 from idam.clouds.pyramid import Pyramid
 from idam.describe.invariant import Descriptor, Surroundings
 from idam.search.judge import CONVERGED, confidence, evidence, weight
@@ -16,6 +16,7 @@ from idam.search.ranking import Answer, same, scored
 from idam.search.scope import Scope
 from idam.search.stages import (
     CONTENDERS,
+    STARVED,
     SURE,
     TAUGHT,
     TIED,
@@ -27,11 +28,12 @@ from idam.search.stages import (
     judged,
     search,
     smallest_rotation,
+    to_match,
 )
 from idam.weights import load_descriptor
 from matchings import level, matching_by, scores_for
 from motions import degrees, move, rigid
-from solids import box, bracket, torus
+from solids import box, boxes, bracket, torus
 
 TRUTH = rigid([1.0, -1.5, 0.8], [0.02, -0.01, 0.03])
 FAR = rigid([0.4, 0.2, -0.1], [9.0, 0.0, 0.0])
@@ -73,6 +75,20 @@ def easy() -> Pyramid:
     return pyramid(points, move(TRUTH, points + np.random.default_rng(0).normal(0, 0.003, (500, 3))))
 
 
+def street_and_a_part_of_it() -> tuple[Pyramid, Pyramid]:
+    """Houses along a street as two clouds, and those of its houses in the middle on all of it."""
+    random = np.random.default_rng(0)
+    corners = random.uniform([-12, -3, 0], [12, 3, 0], (60, 3))
+    sizes = random.uniform(0.2, 1.2, (60, 3))
+
+    def scan(seed: int) -> np.ndarray:
+        return boxes([(low, low + size) for low, size in zip(corners, sizes, strict=True)], 40_000, seed)
+
+    one, other = scan(1), move(TRUTH, scan(2))
+    middle = one[np.abs(one[:, 0]) < 1.5]
+    return pyramid(one, other), pyramid(middle, other)
+
+
 @pytest.fixture(scope="module")
 def truth(easy: Pyramid) -> np.ndarray:
     return easy.enter(TRUTH)
@@ -111,6 +127,17 @@ def test_an_unrelated_pair_is_matched_on_larger_clouds_and_not_counted_on(unrela
 def test_where_the_small_clouds_hold_all_points_they_are_matched(easy: Pyramid, found: Found) -> None:
     assert easy.larger is easy.small
     assert found.matching.clouds is easy.small
+
+
+def test_a_part_of_a_scene_is_matched_at_its_own_scale_too() -> None:
+    street, part = street_and_a_part_of_it()
+    *coarser, finer = [each for each, _ in to_match(part)]
+    assert coarser == [part.small, part.larger]
+    assert min(len(part.larger.source), len(part.larger.target)) < STARVED
+    assert min(len(finer.source), len(finer.target)) > 2 * len(part.larger.source)
+    assert max(len(finer.source), len(finer.target)) <= FINE
+    assert look(part, descriptor=Speechless()).matching.clouds.source_level is finer.source_level
+    assert [each for each, _ in to_match(street)] == [street.small, street.larger]  # of one extent
 
 
 def test_search_is_the_same_bits_every_time(unrelated: Pyramid) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from idam import rigid
 from idam.align import align, reaches
+from idam.clouds.prepared import FINE, SMALL
 from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
@@ -52,6 +53,10 @@ CONTENDS = 0.3
 """Share of the best score from which on an answer is refined on the fine clouds, too."""
 TIED = 0.2
 """Logits by which answers are as likely as the best: a symmetric object's poses differ by chance."""
+STARVED = 400
+"""Points of the smaller cloud, of clouds of different extent, below which both are matched at its own scale. A LiDAR at
+a car's side and the one on its roof: 154 of 1780 points, none of 113 matches right; 709 of 8374, 45 of 600, and right
+with 0.9."""
 SURE = 0.9
 """Confidence from which no larger clouds are matched."""
 
@@ -91,8 +96,8 @@ def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, sco
     """The answers that explain both clouds best.
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
-    larger ones are; the best answers so far have to stand against what they say. At last a network of the paper's kind,
-    where there is one, has a say.
+    larger ones are, and clouds of different extent at the scale of the smaller; the best answers so far have to stand
+    against what they say. At last a network of the paper's kind, where there is one, has a say.
 
     Args:
         clouds: in working coordinates.
@@ -183,6 +188,21 @@ def to_match(clouds: Pyramid) -> Iterator[PairLevel]:
     if not clouds.all_small:
         yield clouds.small
     yield clouds.larger
+    shared = of_the_smaller(clouds)
+    if shared is not None:
+        yield shared
+
+
+def of_the_smaller(clouds: Pyramid) -> PairLevel | None:
+    """Both clouds as fine as the one of less extent is matched best; None where the larger one's scale leaves enough.
+
+    The larger cloud has as many points more as it is larger, up to the number of the last refinement.
+    """
+    if clouds.voxel_size is not None or min(len(clouds.larger.source), len(clouds.larger.target)) >= STARVED:
+        return None
+    both = clouds.source, clouds.target
+    finer = max(min(cloud.voxel_size(SMALL) for cloud in both), max(cloud.voxel_size(FINE) for cloud in both))
+    return clouds.at(finer) if finer < clouds.larger.source_level.voxel_size else None
 
 
 def first_of_its_kind(answers: list[Answer]) -> list[Answer]:
