@@ -8,7 +8,7 @@ import pytest
 from idam import rigid
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
 from idam.search.overlap import shares
-from idam.search.slides import FARTHEST, SLIPPABLE, slides, slippage
+from idam.search.slides import FARTHEST, SLIPPABLE, held, slides, slippage
 from motions import degrees, move
 from motions import rigid as motion
 from solids import ball, bumpy
@@ -174,3 +174,42 @@ def test_what_turns_is_turned_all_the_way() -> None:
 def test_none_is_stepped_over_faster_than_the_spacing(halls: Surfaces) -> None:
     sparse = Surfaces(halls.source, halls.target, 0.4)
     assert 3 < len(slides(sparse, POSE)) < len(slides(halls, POSE))
+
+
+# --- where it is held ----------------------------------------------------------------------------------------------
+
+
+def along_by(pose: np.ndarray, far: float) -> np.ndarray:
+    slid = pose.copy()
+    slid[:3, 3] += far * ALONG
+    return slid
+
+
+def posts(seed: int) -> np.ndarray:
+    """A corridor with three posts on its floor, unevenly apart: one point in fifty."""
+    random = np.random.default_rng(seed)
+    place = random.choice([-0.6, -0.1, 0.55], 60)
+    points = np.stack([place, np.zeros(60), random.uniform(-0.3, 0.0, 60)], 1) + random.normal(0, 0.004, (60, 3))
+    return np.concatenate([hall(3000, seed), points])
+
+
+@pytest.fixture(scope="module")
+def posted() -> Surfaces:
+    return pair(posts(1), move(POSE, posts(2)))
+
+
+@pytest.mark.parametrize("far", [-0.5, -0.2, 0.1, 0.35])
+def test_a_slid_pose_goes_back_to_where_the_posts_agree(posted: Surfaces, far: float) -> None:
+    back = held(posted, posted, along_by(POSE, far))
+    np.testing.assert_allclose(back[:3, :3], POSE[:3, :3], atol=1e-9)
+    assert np.linalg.norm(back[:3, 3] - POSE[:3, 3]) < 1.5 * posted.spacing
+
+
+def test_a_pose_under_which_the_posts_agree_stays(posted: Surfaces) -> None:
+    np.testing.assert_array_equal(held(posted, posted, POSE), POSE)
+
+
+def test_where_nothing_holds_or_nothing_slides_a_pose_stays(halls: Surfaces, lumps: Surfaces) -> None:
+    for surfaces in (halls, lumps):
+        pose = along_by(POSE, 0.2)
+        np.testing.assert_array_equal(held(surfaces, surfaces, pose), pose)

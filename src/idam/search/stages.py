@@ -19,9 +19,9 @@ from idam.rigid import Array
 from idam.search.consensus import agreeing_transforms
 from idam.search.judge import Evidence, confidence, evidence, weight
 from idam.search.matching import Matching
-from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, verified
+from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, scored, verified
 from idam.search.scope import Scope
-from idam.search.slides import slides
+from idam.search.slides import held, slides
 
 __all__ = ["Found", "Network", "search"]
 
@@ -178,9 +178,17 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
     Two that started apart may be one that had not come to rest.
     """
     contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
-    contenders = [verified(answer, matching, fine, method) for answer in contenders]
     rest = answers[len(contenders) :]
+    contenders += held_poses(contenders, matching, fine, method)
+    contenders = [verified(answer, matching, fine, method) for answer in contenders]
     return first_of_its_kind([*sorted(contenders, key=lambda answer: -weight(answer)), *rest])
+
+
+def held_poses(answers: list[Answer], matching: Matching, fine: Surfaces, method: str) -> list[Answer]:
+    """Where answers that slide would stand if what fixes the place had its way: others to choose among, no better yet."""
+    poses = [held(matching.clouds.surfaces, fine, answer.transformation) for answer in answers]
+    new = [pose for pose, answer in zip(poses, answers, strict=True) if (pose != answer.transformation).any()]
+    return [scored(pose, matching, sparse=method == "symmetric") for pose in new]
 
 
 def to_match(clouds: Pyramid) -> Iterator[PairLevel]:
