@@ -131,7 +131,7 @@ def test_where_the_small_clouds_hold_all_points_they_are_matched(easy: Pyramid, 
 
 def test_a_part_of_a_scene_is_matched_at_its_own_scale_too() -> None:
     street, part = street_and_a_part_of_it()
-    *coarser, finer = [each for each, _ in to_match(part)]
+    *coarser, finer = to_match(part)
     assert coarser == [part.small, part.larger]
     assert min(len(part.larger.source), len(part.larger.target)) < STARVED
     assert min(len(finer.source), len(finer.target)) > 2 * len(part.larger.source)

@@ -185,7 +185,7 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
 
 
 def held_poses(answers: list[Answer], matching: Matching, fine: Surfaces, method: str) -> list[Answer]:
-    """Where answers that slide would stand if what fixes the place had its way: others to choose among, no better yet."""
+    """Where what fixes the place would have answers that slide: others to choose among, and no better yet."""
     poses = [held(matching.clouds.surfaces, fine, answer.transformation) for answer in answers]
     new = [pose for pose, answer in zip(poses, answers, strict=True) if (pose != answer.transformation).any()]
     return [scored(pose, matching, sparse=method == "symmetric") for pose in new]
