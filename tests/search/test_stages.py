@@ -137,7 +137,7 @@ def test_a_part_of_a_scene_is_matched_at_its_own_scale_too() -> None:
     assert min(len(finer.source), len(finer.target)) > 2 * len(part.larger.source)
     assert max(len(finer.source), len(finer.target)) <= FINE
     assert look(part, descriptor=Speechless()).matching.clouds.source_level is finer.source_level
-    assert [each for each, _ in to_match(street)] == [street.small, street.larger]  # of one extent
+    assert list(to_match(street)) == [street.small, street.larger]  # of one extent
 
 
 def test_search_is_the_same_bits_every_time(unrelated: Pyramid) -> None:

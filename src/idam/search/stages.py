@@ -11,7 +11,7 @@ import numpy as np
 
 from idam import rigid
 from idam.align import align, reaches
-from idam.clouds.prepared import FINE, SMALL
+from idam.clouds.prepared import FINE, SPARSE
 from idam.clouds.pyramid import PairLevel, Pyramid
 from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
@@ -209,7 +209,7 @@ def of_the_smaller(clouds: Pyramid) -> PairLevel | None:
     if clouds.voxel_size is not None or min(len(clouds.larger.source), len(clouds.larger.target)) >= STARVED:
         return None
     both = clouds.source, clouds.target
-    finer = max(min(cloud.voxel_size(SMALL) for cloud in both), max(cloud.voxel_size(FINE) for cloud in both))
+    finer = max(min(cloud.voxel_size(SPARSE) for cloud in both), max(cloud.voxel_size(FINE) for cloud in both))
     return clouds.at(finer) if finer < clouds.larger.source_level.voxel_size else None
 
 
