@@ -76,8 +76,9 @@ def polish(surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Array, Ar
         return _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
     source, target = (Dense.of(cloud) for cloud in points)
     step = max(1, size // EACH, math.ceil(len(source.points) / MOST))
-    patches, _, _ = source.patches(source.points[::step], size)
-    return _settled(lambda at: Pairs.of_patches(patches, target, at, size), start, surfaces.spacing)
+    places = source.points[::step]
+    patches, _, _ = source.patches(places, size)
+    return _settled(lambda at: Pairs.of_patches(patches, places, target, at, size), start, surfaces.spacing)
 
 
 def _settled(pairs_of: Callable[[Array], Pairs], start: Array, spacing: float) -> tuple[Array, Pairs]:
