@@ -89,19 +89,22 @@ class Pairs:
         _, mine, row = surfaces.touching(transformation)
         source, target = surfaces.source, surfaces.target
         one = Patches(source.points[mine], source.normals[mine])
-        return cls._alike(one, Patches(target.points[row], target.normals[row]), transformation)
+        return cls.alike(one, Patches(target.points[row], target.normals[row]), transformation)
 
     @classmethod
-    def of_patches(cls, source: Patches, target: Dense, transformation: Array, size: int) -> Pairs:
-        """Each patch of the source with the target's where a transform (4, 4) lays it, if one goes on as the other."""
-        other, radii, _ = target.patches(rigid.apply(transformation, source.centres), size)
+    def of_patches(cls, source: Patches, places: Array, target: Dense, transformation: Array, size: int) -> Pairs:
+        """Each patch of the source with the target's where a transform (4, 4) lays it, if one goes on as the other.
+
+        Both lie around the same places (C, 3): where these lie off the surface, both means follow them alike.
+        """
+        other, radii, _ = target.patches(rigid.apply(transformation, places), size)
         gaps = rigid.apply(transformation, source.centres) - other.centres
         near = np.linalg.norm(gaps, axis=1) <= TANGENT * radii
         one = Patches(source.centres[near], source.normals[near])
-        return cls._alike(one, Patches(other.centres[near], other.normals[near]), transformation)
+        return cls.alike(one, Patches(other.centres[near], other.normals[near]), transformation)
 
     @classmethod
-    def _alike(cls, source: Patches, target: Patches, transformation: Array) -> Pairs:
+    def alike(cls, source: Patches, target: Patches, transformation: Array) -> Pairs:
         """Those whose normals agree, in the source's coordinates."""
         gaps = source.centres - rigid.apply(rigid.inverse(transformation), target.centres)
         normals = target.normals @ transformation[:3, :3]
