@@ -22,8 +22,9 @@ import numpy as np
 from idam import rigid
 from idam.errors import InputError, MissingDependencyError
 from idam.io.cloud import PointCloud
-from idam.io.columns import Numbers, check_size, cloud_from_columns, normal_names
+from idam.io.columns import Numbers, check_size, cloud_from_columns
 from idam.io.files import StrPath, check_unpacked_size, one_line, replacing, silenced
+from idam.io.names import normal_names
 
 __all__ = ["MOST_POINTS", "check_installed", "encode", "move", "read"]
 

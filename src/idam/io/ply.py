@@ -17,12 +17,11 @@ from idam.io.columns import (
     check_size,
     finite,
     named_cloud,
-    normal_names,
     parse_numbers,
-    position_names,
     without_windows_nan,
 )
 from idam.io.mesh import coordinate_type, fan, mesh_or_cloud, triangles
+from idam.io.names import normal_names, position_names
 
 __all__ = ["decode", "encode", "move"]
 
