@@ -16,6 +16,7 @@ from idam.io.names import color_names, normal_names, position_names
 
 __all__ = [
     "Numbers",
+    "check_is_binary",
     "check_size",
     "cloud_from_columns",
     "cloud_from_table",
@@ -29,7 +30,9 @@ __all__ = [
     "parse_rows",
     "to_uint8",
     "unnamed_cloud",
+    "whole_as_integers",
     "without_windows_nan",
+    "words_in_lines",
 ]
 
 Numbers = NDArray[Any]
@@ -47,6 +50,9 @@ _TRIPLES = {6: (3,), 7: (4,), 9: (3, 6)}
 _WINDOWS_NAN = re.compile(
     rb"[+-]?\d(?:\.[#$]\w*|,#(?:[QS]?NAN|IND|INF)\w*)|[+-]?nan\(\w*\)|#(?:N/A|NUM!|DIV/0!|VALUE!|REF!)", re.IGNORECASE
 )
+
+
+_NUMBERS_AS_TEXT = re.compile(rb"[\s\d.eE+-]{24,}")
 
 
 def cloud_from_columns(columns: Mapping[str, Numbers]) -> PointCloud:
@@ -175,6 +181,33 @@ def parse_rows(rows: Sequence[Sequence[bytes]], what: str) -> NDArray[np.float64
     if short is not None:
         raise InputError(f"damaged: {what} holds {len(short)} numbers, the first {width}: export it again")
     return parse_numbers(b" ".join(word for row in rows for word in row)).reshape(len(rows), width)
+
+
+def words_in_lines(text: bytes) -> NDArray[np.int64]:
+    """Count the words of each line of a text, empty lines left out."""
+    letters = np.frombuffer(b" " + text + b"\n", np.uint8)
+    is_space = letters <= 32
+    starts = np.flatnonzero(is_space[:-1] & ~is_space[1:])
+    ends = np.flatnonzero((letters[1:] == 10) | (letters[1:] == 13))
+    counts = np.diff(np.searchsorted(starts, ends), prepend=0)
+    return counts[counts > 0]
+
+
+def whole_as_integers(values: NDArray[Any]) -> NDArray[Any]:
+    """Make integers of a column that was read as floats; one with fractions or NaN stays as it is."""
+    with np.errstate(all="ignore"):
+        integers = values.astype(np.int64)
+        return integers if (integers == values).all() else values
+
+
+def check_is_binary(body: bytes) -> None:
+    """Refuse text where a header promises bytes.
+
+    Raises:
+        InputError: it is text.
+    """
+    if _NUMBERS_AS_TEXT.fullmatch(body[:200]):
+        raise InputError("damaged: its header says binary, but numbers follow as text: export it again")
 
 
 def _is_float(word: bytes) -> bool:

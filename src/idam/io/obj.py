@@ -78,7 +78,12 @@ def move(data: bytes, transformation: rigid.Array) -> bytes:
 
 
 def _lines(data: bytes) -> list[bytes]:
-    return without_windows_nan(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
+    return (
+        without_windows_nan(data.removeprefix(b"\xef\xbb\xbf"))
+        .replace(b"\\\r\n", b" ")
+        .replace(b"\\\n", b" ")
+        .splitlines()
+    )
 
 
 def _points_and_colors(vertices: list[list[bytes]]) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:

@@ -32,23 +32,22 @@ def refuse_two_readings(table: Numbers, commas: bool, lines: list[str]) -> None:
         InputError: there are two readings.
     """
     rows, width = table.shape
+    if rows > 1 and (table[0] == np.arange(width)).all() and not any(map(_is_whole, table[1:].T)):
+        raise InputError(
+            f"its first line (0 1 2) may be a point or number the columns: {NAME_THEM} x y z, or remove it"
+        )
     if width < 4:
-        first_row_counts = rows > 1 and (table[0] == np.arange(width)).all()
-        if first_row_counts and not _is_whole(table[1:]).any():
-            raise InputError(
-                f"its first line (0 1 2) may be a point or number the columns: {NAME_THEM} x y z, or remove it"
-            )
         return
     if rows >= 3 and (np.diff(table[:, 0]) == 1).all() and _is_whole(table[:, 0]):
         raise InputError(f"its first column seems to number the rows, not to be x: {NAME_THEM} number x y z")
-    if rows >= 2 and _is_whole(table[:, 0]) and not any(_is_whole(column) for column in table[:, 1:4].T):
+    if rows >= 2 and _is_whole(table[:, 0]) and not any(map(_is_whole, table[:, 1:4].T)):
         raise InputError(
             f"its first column alone holds whole numbers, which seem to be no x: {NAME_THEM} number x y z, "
             "or x y z and what follows"
         )
-    with np.errstate(all="ignore"):
-        if np.nanmin(table[:, 0]) > LARGEST > np.nanmax(np.abs(table[:, 1:4])):
-            raise InputError(f"its first column seems to be a time, not x: {NAME_THEM} time x y z")
+    known = table[np.isfinite(table[:, :4]).all(axis=1), :4]
+    if len(known) and known[:, 0].min() > LARGEST > np.abs(known[:, 1:]).max():
+        raise InputError(f"its first column seems to be a time, not x: {NAME_THEM} time x y z")
     if width >= 5 and rows >= 3 and _is_grid(table):
         raise InputError(
             f"its first two columns seem to be a scanner's rows and columns: {NAME_THEM} row column x y z, "
@@ -66,8 +65,9 @@ def counts(column: Numbers) -> bool:
     return bool(column[0] in (0, 1) and (column == column[0] + np.arange(len(column))).all())
 
 
-def _is_whole(values: Numbers) -> bool | np.bool:
-    return (values[np.isfinite(values)] == np.round(values[np.isfinite(values)])).all()
+def _is_whole(values: Numbers) -> bool:
+    known = values[np.isfinite(values)]
+    return bool((known == np.round(known)).all())
 
 
 def _has_two_commas(table: Numbers, lines: list[str]) -> bool:

@@ -94,8 +94,9 @@ def _encoding(data: bytes) -> str:
     known = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), None)
     if known is not None:
         return known
-    zero = [byte == 0 for byte in data[:2]]  # of an ASCII character
-    return {(False, True): "utf-16-le", (True, False): "utf-16-be"}.get(tuple(zero), "utf-8")
+    if b"\0" not in data[:2]:
+        return "utf-8"
+    return "utf-16-be" if data.startswith(b"\0") else "utf-16-le"  # of an ASCII character, one byte is 0
 
 
 def _without_bars(lines: list[str]) -> list[str]:
