@@ -48,10 +48,10 @@ _TRIPLES = {6: (3,), 7: (4,), 9: (3, 6)}
 
 # C runtimes of Windows write 1.#QNAN, -1.#IND, 1.#INF and, rounded, 1.#R or -1.$ ; newer ones -nan(ind); Excel #N/A.
 _WINDOWS_NAN = re.compile(
-    rb"[+-]?\d(?:\.[#$]\w*|,#(?:[QS]?NAN|IND|INF)\w*)|[+-]?nan\(\w*\)|#(?:N/A|NUM!|DIV/0!|VALUE!|REF!)", re.IGNORECASE
+    rb"[+-]?\d(?:\.[#$]\w*|,#(?:[QS]?NAN|IND|INF)\w*)|[+-]?nan\(\w*\)|"
+    rb"#(?:N/A|NV\b|(?:NUM|DIV/0|VALUE|REF|WERT|ZAHL|BEZUG|VALEUR|NOMBRE|VALOR)!)",
+    re.IGNORECASE,
 )
-
-
 _NUMBERS_AS_TEXT = re.compile(rb"[\s\d.eE+-]{24,}")
 
 
