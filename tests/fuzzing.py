@@ -110,7 +110,7 @@ def read_or_refuse(path: Path, content: bytes, read: Callable[[Path], Any], outp
                 found = read(path)
             except InputError as error:
                 found = None
-                check_refusal(error, f"{path}: ", *([f"{output}: "] if output else []))
+                check_refusal(error, path, *([output] if output else []))
         if isinstance(found, PointCloud):
             assert len(found.points) and np.isfinite(found.points).all()
     except BaseException:
