@@ -90,12 +90,13 @@ def spoiled(data: bytes, changes: list[tuple[int, str]], abouts: list[tuple[str,
     """A whole file that holds something else under a name or two."""
     arrays = load(data)
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-    about = json.loads(header["__metadata__"]["idam"]) | dict(abouts)
+    metadata = header["__metadata__"]
+    about = json.loads(metadata["idam"]) | dict(abouts)
     for place, change in changes:
         name = sorted(arrays)[place % len(arrays)]
         with np.errstate(all="ignore"):
             arrays[name] = np.ascontiguousarray(CHANGES[change](arrays[name]))
-    return bytes(save(arrays, {"idam": json.dumps(about)}))
+    return bytes(save(arrays, {**metadata, "idam": json.dumps(about)}))
 
 
 def test_prepared_clouds_that_hold_something_else(folder: Path) -> None:
@@ -151,9 +152,8 @@ def test_damaged_batches(folder: Path, name: str) -> None:
     check()
 
 
-ROWS = "".join(
-    json.dumps({"key": f"{n}", "source": "a", "target": "b", "error": "", "confidence": 0.5}) + "\n" for n in range(4)
-)
+ROW = {"error": "", "transformation": np.eye(4).tolist(), "information": np.eye(6).tolist(), "reach": 0.1}
+ROWS = "".join(json.dumps({"key": f"{n}", **ROW, "confidence": 0.5}) + "\n" for n in range(4))
 
 
 @examples(60)
@@ -161,7 +161,9 @@ ROWS = "".join(
 def test_damaged_pairs_of_a_merge(folder: Path, data: bytes) -> None:
     def keep(path: Path) -> Any:
         kept = Kept(path)
-        kept.add("new", {"error": ""})
+        for row in kept.rows.values():
+            assert row["error"] or np.isfinite(np.array(row["transformation"], float)).all()
+        kept.add("new", {**ROW, "confidence": 0.5})
         assert "new" in Kept(path).rows
         return kept
 
