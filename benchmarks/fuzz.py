@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1] / "tests"
@@ -34,13 +34,12 @@ def main() -> None:
     options, picked = parser.parse_known_args()
     started, rounds, failed = time.monotonic(), 0, False
     inputs: Counter[str] = Counter()
-    seconds: Counter[str] = Counter()
+    seconds: defaultdict[str, float] = defaultdict(float)
     peak = 0.0
     while not failed and time.monotonic() - started < 60 * options.minutes and inputs.total() < options.inputs:
         seed = secrets.randbelow(2**32)
-        figures, output = run_round(seed, options.examples, picked)
-        failed, rounds = bool(output), rounds + 1
-        peak = max(peak, figures.pop("peak GB", 0.0))
+        figures, memory, output = run_round(seed, options.examples, picked)
+        failed, rounds, peak = bool(output), rounds + 1, max(peak, memory)
         for name, (count, spent) in figures.items():
             inputs[kind_of(name)] += int(count)
             seconds[kind_of(name)] += spent
@@ -50,13 +49,13 @@ def main() -> None:
     print("\n| kind | inputs | seconds of processor time |\n|---|---|---|")
     for name, count in sorted(inputs.items()):
         print(f"| {name} | {count:,} | {seconds[name]:.0f} |")
-    print(f"| all | {inputs.total():,} | {seconds.total():.0f} |")
+    print(f"| all | {inputs.total():,} | {sum(seconds.values()):.0f} |")
     print(f"\n{rounds} rounds, {'failures' if failed else 'no failure'}, at most {peak:.2f} GB of memory")
     sys.exit(failed)
 
 
-def run_round(seed: int, examples: int, picked: list[str]) -> tuple[dict[str, list[float]], str]:
-    """What a round took, by test; and what pytest printed if anything failed."""
+def run_round(seed: int, examples: int, picked: list[str]) -> tuple[dict[str, list[float]], float, str]:
+    """What a round took, by test; gigabytes of memory at most; and what pytest printed if anything failed."""
     with tempfile.TemporaryDirectory() as folder:
         log, found = Path(folder) / "log.json", Path(folder) / "found"
         found.mkdir()
@@ -80,7 +79,7 @@ def run_round(seed: int, examples: int, picked: list[str]) -> tuple[dict[str, li
             FOUND.mkdir(exist_ok=True)
             (FOUND / f"{seed}-{path.name}").write_bytes(path.read_bytes())
         figures = json.loads(log.read_text()) if log.exists() else {}
-        return figures, "" if done.returncode == 0 else done.stdout + done.stderr
+        return figures, figures.pop("peak GB", 0.0), "" if done.returncode == 0 else done.stdout + done.stderr
 
 
 def kind_of(test: str) -> str:
