@@ -86,7 +86,10 @@ def _split_lines(data: bytes) -> list[str]:
         except UnicodeDecodeError:
             text = data.decode("latin-1")
     text = text.rstrip("\x1a").replace("\u2212", "-")  # the end of a file of DOS, and the typographic minus
-    lines = _COMMENTS.sub(r"\1#", text.replace("\r\n", "\n").replace("\r", "\n")).splitlines()
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if any(mark in text for mark in ("//", "%", "!", ";")):  # most files have none, and the search is slow
+        text = _COMMENTS.sub(r"\1#", text)
+    lines = text.splitlines()
     return _without_bars(lines) if "|" in text else lines
 
 
