@@ -1,108 +1,37 @@
-"""Damaged, absurd and hostile input: read or refused in one line, quickly, in little memory.
-
-The same every time; but where the environment's IDAM_FUZZ says how many examples each test takes, as ``make fuzz``
-does, they are fresh ones, and what fails is kept in .hypothesis and tried first the next time.
-"""
+"""Damaged, absurd and hostile files and arrays: read or refused in one line, quickly, in little memory."""
 
 from __future__ import annotations
 
 import gzip
 import io
-import os
-import re
 import struct
-import time
-import warnings
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.database import DirectoryBasedExampleDatabase
 from hypothesis.extra import numpy as hnp
 
+import fuzzing
+from fuzzing import check_refusal, damaged, examples, limits, needs_proc, read_or_refuse
 from idam.clouds.frame import check_points
 from idam.errors import InputError
 from idam.io import PointCloud, as_point_cloud, move_file, read_point_cloud, read_transform, write_point_cloud
 from idam.io.notations import FORMS
 
-resource = pytest.importorskip("resource", reason="memory is limited by setrlimit, which this system lacks")
-
-MEMORY = 2**28
-"""Bytes of address space that reading a file of some kilobytes may take: more than 256 MB is a blow-up."""
-SECONDS = 2.0
-"""Processor time it may take."""
-
-FRESH = int(os.environ.get("IDAM_FUZZ", "0"))
-fuzz = settings(
-    max_examples=FRESH or 60,
-    deadline=None,
-    derandomize=not FRESH,
-    database=DirectoryBasedExampleDatabase(".hypothesis/fuzz") if FRESH else None,
-    suppress_health_check=list(HealthCheck),
-)
-few = settings(fuzz, max_examples=FRESH or 20)
-
-
-@contextmanager
-def little_memory() -> Iterator[None]:
-    """Lets the process grow by so much and no more."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
+figures = fuzzing.figures
+fuzz, few = examples(60), examples(20)
 MOTION = np.array([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
 
-needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory's size from")
 pytestmark = needs_proc
-
-
-TRIED: list[int] = []
-
-
-@pytest.fixture(scope="module", autouse=True)
-def count() -> Iterator[None]:
-    """Leaves the number of inputs for benchmarks/fuzz.py."""
-    yield
-    if "IDAM_FUZZ_COUNT" in os.environ:
-        Path(os.environ["IDAM_FUZZ_COUNT"]).write_text(str(len(TRIED)))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
-
-
-def read_or_refuse(
-    path: Path, content: bytes, read: Callable[[Path], Any] = read_point_cloud, output: Path | None = None
-) -> Any:
-    """What is read, or None where it is refused as it should be."""
-    TRIED.append(len(content))
-    path.write_bytes(content)
-    started = time.process_time()
-    try:
-        with little_memory(), warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            found = read(path)
-    except InputError as error:
-        found, message = None, str(error)
-        assert message.startswith((f"{path}: ", f"{output}: ")) and "\n" not in message and len(message) < 500
-        assert "memory" not in message
-    assert not warned
-    assert time.process_time() - started < SECONDS
-    if isinstance(found, PointCloud):
-        assert len(found.points) and np.isfinite(found.points).all()
-    return found
 
 
 # --- real files, damaged -------------------------------------------------------------------------------------------
@@ -159,46 +88,6 @@ def real_file(folder: Path, name: str) -> bytes:
     return (folder / f"valid.{suffix}").read_bytes()
 
 
-HUGE = [b"1000000000000", b"18446744073709551616", b"4294967295", b"-1", b"0", b"1e308", b"9" * 5000, b"nan"]
-
-
-def _flip(draw: st.DrawFn, data: bytes) -> bytes:
-    at = draw(st.integers(0, min(300, len(data) - 1)) | st.integers(0, len(data) - 1))
-    return data[:at] + bytes([draw(st.integers(0, 255))]) + data[at + 1 :]
-
-
-def _fill(draw: st.DrawFn, data: bytes) -> bytes:
-    at, length = draw(st.integers(0, len(data) - 1)), draw(st.sampled_from([1, 4, 8, 64]))
-    return data[:at] + draw(st.sampled_from([b"\0", b"\xff", b"\n", b" "])) * length + data[at + length :]
-
-
-def _cut_out(draw: st.DrawFn, data: bytes) -> bytes:
-    at = draw(st.integers(0, len(data) - 1))
-    return data[:at] + data[at + draw(st.integers(1, 200)) :]
-
-
-def _repeat(draw: st.DrawFn, data: bytes) -> bytes:
-    at = draw(st.integers(0, len(data) - 1))
-    return data[:at] + data[at : at + 100] * draw(st.integers(2, 50)) + data[at:]
-
-
-def _promise(draw: st.DrawFn, data: bytes) -> bytes:
-    """One of the first numbers of the text becomes an absurd one."""
-    numbers = list(re.finditer(rb"\d+", data[:400]))
-    if not numbers:
-        return data
-    chosen = draw(st.sampled_from(numbers))
-    return data[: chosen.start()] + draw(st.sampled_from(HUGE)) + data[chosen.end() :]
-
-
-@st.composite
-def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
-    data = valid
-    for damage in draw(st.lists(st.sampled_from([_flip, _fill, _cut_out, _repeat, _promise]), max_size=3)):
-        data = damage(draw, data) or b"\n"
-    return data[: draw(st.just(len(data)) | st.integers(0, len(data)))]
-
-
 NAMES = [
     "a.ply",
     "ascii.ply",
@@ -221,12 +110,12 @@ def test_damaged_files(folder: Path, name: str) -> None:
     if name.endswith(".stl"):
         pytest.importorskip("trimesh", reason="STL is read with trimesh")
     valid, path = real_file(folder, name), folder / name
-    assert read_or_refuse(path, valid) is not None
+    assert read_or_refuse(path, valid, read_point_cloud) is not None
 
     @fuzz
     @given(damaged(valid))
     def check(data: bytes) -> None:
-        read_or_refuse(path, data)
+        read_or_refuse(path, data, read_point_cloud)
 
     check()
 
@@ -366,10 +255,10 @@ MADE_UP = {
 
 @pytest.mark.parametrize("name", MADE_UP)
 def test_made_up_files(folder: Path, name: str) -> None:
-    @settings(fuzz, max_examples=FRESH or 120)
+    @examples(120)
     @given(MADE_UP[name])
     def check(content: bytes) -> None:
-        read_or_refuse(folder / name, content)
+        read_or_refuse(folder / name, content, read_point_cloud)
 
     check()
 
@@ -384,7 +273,7 @@ def test_made_up_las_headers(folder: Path, suffix: str) -> None:
         content = bytearray(valid)
         for at, value in fields:
             struct.pack_into("<I", content, at, value)
-        read_or_refuse(folder / f"made.{suffix}", bytes(content))
+        read_or_refuse(folder / f"made.{suffix}", bytes(content), read_point_cloud)
 
     check()
 
@@ -393,12 +282,15 @@ def test_made_up_las_headers(folder: Path, suffix: str) -> None:
 @few
 @given(size=st.sampled_from([0, 1, 83, 84, 10**5]), byte=st.sampled_from(b"\0\xff \n,1#vO"))
 def test_one_byte_over_and_over(folder: Path, suffix: str, size: int, byte: int) -> None:
-    assert read_or_refuse(folder / f"same.{suffix}", bytes([byte]) * size) is None
+    assert read_or_refuse(folder / f"same.{suffix}", bytes([byte]) * size, read_point_cloud) is None
 
 
 def test_thousands_of_materials_and_corners(folder: Path) -> None:
     parts = b"".join(b"usemtl m%d\nf 1 2 3\n" % n for n in range(5000))
-    assert read_or_refuse(folder / "materials.obj", b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n" + parts) is not None
+    assert (
+        read_or_refuse(folder / "materials.obj", b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n" + parts, read_point_cloud)
+        is not None
+    )
     header, lists = (
         POLYGONS.split("element face")[0],
         "element face 1\nproperty list uint uchar vertex_index\nend_header\n",
@@ -406,7 +298,7 @@ def test_thousands_of_materials_and_corners(folder: Path) -> None:
     square = struct.pack("<12f", 0, 0, 0, 1, 0, 0, 1, 1, 0, 0, 1, 0)
     corners = struct.pack("<I", 2**20) + bytes(range(4)) * 2**18
     binary = (header.replace("ascii", "binary_little_endian") + lists).encode()
-    assert read_or_refuse(folder / "corners.ply", binary + square + corners) is not None
+    assert read_or_refuse(folder / "corners.ply", binary + square + corners, read_point_cloud) is not None
 
 
 @pytest.mark.skipif(np.finfo(np.longdouble).max == np.finfo(np.float64).max, reason="no extended floats here")
@@ -417,7 +309,14 @@ def test_extended_floats_past_the_largest_double_are_left_out(folder: Path, suff
     stream = io.BytesIO()
     np.save(stream, points)
     pcd = b"FIELDS x y z\nSIZE 16 16 16\nTYPE F F F\nPOINTS 5\nDATA binary\n" + points.tobytes()
-    assert len(read_or_refuse(folder / f"wide.{suffix}", {"npy": stream.getvalue(), "pcd": pcd}[suffix]).points) == 4
+    assert (
+        len(
+            read_or_refuse(
+                folder / f"wide.{suffix}", {"npy": stream.getvalue(), "pcd": pcd}[suffix], read_point_cloud
+            ).points
+        )
+        == 4
+    )
 
 
 @fuzz
@@ -454,14 +353,13 @@ def test_transforms_that_overflow_are_refused(folder: Path, huge: str) -> None:
 
 def checked(data: Any) -> np.ndarray | None:
     """What registration makes of it, or None where it is refused as it should be."""
-    TRIED.append(0)
-    try:
-        with little_memory(), np.errstate(over="ignore"):
+    with limits(), np.errstate(over="ignore"):
+        try:
             points = as_point_cloud(data).points
             check_points(points, "source")
-    except InputError as error:
-        assert "\n" not in str(error) and len(str(error)) < 500
-        return None
+        except InputError as error:
+            check_refusal(error)
+            return None
     assert points.dtype == np.float64
     assert points.ndim == 2 and points.shape[1] == 3 and len(points) >= 20
     assert np.isfinite(points).all()
@@ -472,7 +370,7 @@ DTYPES = hnp.scalar_dtypes() | st.sampled_from([np.dtype("O"), np.dtype([("x", "
 SHAPES = hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4) | st.sampled_from([(25, 3), (3, 25), (25, 4)])
 
 
-@settings(fuzz, max_examples=FRESH or 150)
+@examples(150)
 @given(st.data())
 def test_any_array(data: st.DataObject) -> None:
     checked(data.draw(hnp.arrays(data.draw(DTYPES), data.draw(SHAPES), fill=st.nothing())))

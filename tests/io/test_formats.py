@@ -184,6 +184,14 @@ def test_a_moved_mesh_is_a_mesh(tmp_path: Path, source: str, target: str) -> Non
     np.testing.assert_allclose(moved.vertices.points[moved.faces], expected, atol=1e-5)
 
 
+def test_an_stl_of_several_solids_is_all_of_them(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh")
+    facet = "facet normal 0 0 1\nouter loop\nvertex {0} 0 0\nvertex {1} 0 0\nvertex {0} 1 0\nendloop\nendfacet\n"
+    solids = "".join(f"solid {at}\n{facet.format(at, at + 1)}endsolid {at}\n" for at in (0, 5))
+    points = read(tmp_path, "a.stl", solids).points
+    assert len(points) == 20_000 and points[:, 0].max() > 5 and not ((points[:, 0] > 1) & (points[:, 0] < 5)).any()
+
+
 def test_a_moved_mesh_without_a_place_for_faces_is_sampled_with_a_word(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -344,6 +352,54 @@ def test_large_las_is_thinned_while_it_is_read(
     assert len(read_point_cloud(tmp_path / "b.laz").points) == 500
 
 
+def test_copc_is_read_to_the_level_that_the_work_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from idam.io import las
+    from octrees import write_copc
+
+    points = np.random.default_rng(1).uniform(-50, 50, (8000, 3)).round(3)
+    for pages in (False, True):
+        level = write_copc(tmp_path / "a.copc.laz", points, levels=4, pages=pages)
+        assert len(read_point_cloud(tmp_path / "a.copc.laz").points) == 8000
+        for most, levels in ((3000, 3), (1000, 2), (10, 1)):
+            monkeypatch.setattr(las, "COPC_POINTS", most)
+            cloud = read_point_cloud(tmp_path / "a.copc.laz")
+            numbers = np.sort(cloud.attributes["intensity"].astype(int))
+            np.testing.assert_array_equal(numbers, np.flatnonzero(level < levels))
+            order = cloud.attributes["intensity"].astype(int)
+            np.testing.assert_allclose(cloud.points, points[order], atol=1e-3)
+            assert f"of its 8,000 points, {levels} levels of its octree" in caplog.text
+        monkeypatch.undo()
+
+
+def test_a_damaged_octree_of_copc_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from idam.io import las
+    from octrees import ENTRY, write_copc
+
+    write_copc(tmp_path / "a.copc.laz", np.random.default_rng(1).uniform(-50, 50, (2000, 3)), levels=3, pages=True)
+    monkeypatch.setattr(las, "COPC_POINTS", 500)
+    whole = (tmp_path / "a.copc.laz").read_bytes()
+    (at, size) = struct.unpack_from("<2Q", whole, 375 + 54 + 40)
+    first = np.frombuffer(whole, ENTRY, size // 32, at)
+    link = at + 32 * int(np.flatnonzero(first["count"] == -1)[0])
+    changes = {
+        "count": (at + 28, "<i", 2**31 - 1),
+        "offset": (at + 16, "<Q", 2**63),
+        "size": (at + 24, "<i", 2**31 - 1),
+        "level": (at, "<i", 10**9),
+        "a page that is itself": (link + 16, "<Q", at),
+        "a page past the end": (link + 16, "<Q", 2**62),
+        "a long page": (link + 24, "<i", 2**31 - 1),
+        "the first page": (375 + 54 + 40, "<Q", 2**62),
+    }
+    for place, form, value in changes.values():
+        content = bytearray(whole)
+        struct.pack_into(form, content, place, value)
+        with pytest.raises(InputError):
+            read(tmp_path, "b.copc.laz", bytes(content))
+
+
 # --- E57 -----------------------------------------------------------------------------------------------------------
 
 
@@ -390,6 +446,24 @@ def test_e57_invalid_points_and_colours(tmp_path: Path) -> None:
     assert len(cloud.points) == 30
     np.testing.assert_array_equal(cloud.colors, colors.T[state == 0])
     assert "cartesianInvalidState" not in cloud.attributes
+
+
+def test_e57_keeps_rows_and_columns(tmp_path: Path) -> None:
+    grid = {"rowIndex": np.arange(40, dtype=np.uint16), "columnIndex": np.arange(40, dtype=np.uint16)[::-1].copy()}
+    e57_file(tmp_path / "a.e57", e57_scan(**grid))
+    move_file(tmp_path / "a.e57", MOTION, tmp_path / "b.e57")
+    for name, values in grid.items():
+        np.testing.assert_array_equal(read_point_cloud(tmp_path / "b.e57").attributes[name], values)
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed"])
+def test_a_damaged_e57_is_refused_in_a_line(tmp_path: Path, damage: str) -> None:
+    e57_file(tmp_path / "a.e57", e57_scan())
+    data = bytearray((tmp_path / "a.e57").read_bytes())
+    data[1500] ^= 255
+    with pytest.raises(InputError, match="damaged") as error:
+        read(tmp_path, "b.e57", bytes(data[:3000] if damage == "cut" else data))
+    assert "****" not in str(error.value) and "exception" not in str(error.value)
 
 
 def test_e57_is_written_with_poses_and_far_from_the_origin(tmp_path: Path) -> None:

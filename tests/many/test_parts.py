@@ -59,15 +59,17 @@ def test_scans_of_one_object_are_likelier_partners_than_of_two() -> None:
 
 def test_kept_rows_come_back_and_a_torn_line_does_not(tmp_path: Path) -> None:
     path = tmp_path / "pairs.jsonl"
+    row = {"error": "", "transformation": np.eye(4).tolist(), "information": np.eye(6).tolist()}
+    row |= {"confidence": 0.5, "reach": 0.1}
     kept = Kept(path)
     for key in "abc":
-        kept.add(key, {"value": key})
+        kept.add(key, row)
     path.write_text(path.read_text()[:-5])
     again = Kept(path)
     assert set(again.rows) == {"a", "b"}
-    again.add("d", {"value": "d"})
+    again.add("d", row)
     assert set(Kept(path).rows) == {"a", "b", "d"}
-    path.write_text(path.read_text() + "no json\n[1]\n{}\n")
+    path.write_text(path.read_text() + "no json\n[1]\n{}\n" + json.dumps({**row, "key": "e", "reach": None}) + "\n")
     assert set(Kept(path).rows) == {"a", "b", "d"}
 
 

@@ -96,7 +96,12 @@ def read_run(folder: StrPath) -> tuple[list[Row], int]:
     folder = Path(folder)
     if not (folder / MANIFEST).is_file():
         raise InputError(f"{folder}: is not the folder of a batch (it has no {MANIFEST}): name the one given as -o")
-    ids = [json.loads(line)["id"] for line in read_bytes(folder / PAIRS).decode().splitlines()]
+    try:
+        ids = [str(json.loads(line)["id"]) for line in read_bytes(folder / PAIRS).decode().splitlines()]
+    except (ValueError, TypeError, KeyError) as error:
+        raise (
+            error if isinstance(error, InputError) else InputError(f"{folder / PAIRS}: damaged: run the batch anew")
+        ) from None
     rows = _read_rows(folder)
     return [rows[name] for name in ids if name in rows], sum(name not in rows for name in ids)
 
@@ -184,7 +189,7 @@ def _lines(path: Path) -> Iterator[Row]:
                 return
             try:
                 row = json.loads(line)
-                row["id"], row["status"]
+                row["status"], {row["id"]}
             except (ValueError, TypeError, KeyError):
                 raise InputError(f"{path}, line {number}: damaged: delete the line, and run again") from None
             yield row

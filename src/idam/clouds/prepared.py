@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ LARGER = 2000
 """Points of the larger cloud that are matched where the small clouds do not settle the matter."""
 FINE = 10_000
 """Points of the larger cloud that the last refinement uses."""
-FORMAT = 1
+FORMAT = 2
 """Of saved clouds: changes when they can no longer be read, or would give other answers."""
 BASE = 100_000
 """Points that are kept of a cloud, besides those given: all levels are thinned from them."""
@@ -180,10 +181,9 @@ class Prepared:
             level = self.levels[size]
             arrays[f"{number}.points"] = level.points
             arrays |= {f"{number}.{key}.{step}": features for (key, step), features in level.features.items()}
-        about = {"format": FORMAT, "name": self.name, "radius": self.radius, "sizes": sizes}
-        write_bytes(
-            path, save({key: np.ascontiguousarray(x) for key, x in arrays.items()}, {"idam": json.dumps(about)})
-        )
+        arrays = {key: np.ascontiguousarray(x) for key, x in arrays.items()}
+        about = json.dumps({"format": FORMAT, "name": self.name, "radius": self.radius, "sizes": sizes})
+        write_bytes(path, save(arrays, {"idam": about, "sha256": _digest(about, arrays)}))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Prepared:
@@ -194,10 +194,13 @@ class Prepared:
         """
         try:
             with safe_open(path, "np") as file:
-                about = json.loads(file.metadata()["idam"])
+                metadata = file.metadata()
+                about = json.loads(metadata["idam"])
                 if about["format"] != FORMAT:
                     raise ValueError("another version of idam wrote it")
                 arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+                if metadata["sha256"] != _digest(metadata["idam"], arrays):
+                    raise ValueError("its content has changed")
             cloud = cls(arrays.pop("points"), about["name"], arrays.pop("centre"), float(about["radius"]))
             for number, size in enumerate(about["sizes"]):
                 level = cloud.levels[size] = Level(arrays.pop(f"{number}.points"), size)
@@ -208,3 +211,13 @@ class Prepared:
             reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
             raise InputError(f"{path}: not a prepared cloud ({reason}); make it anew with idam.prepare") from None
         return cloud
+
+
+def _digest(about: str, arrays: dict[str, NDArray[Any]]) -> str:
+    """What tells a file as it was written from one that was damaged since: nothing else of it need be doubted."""
+    digest = hashlib.sha256(about.encode())
+    for key in sorted(arrays):
+        array = arrays[key]
+        digest.update(f"{key} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()

@@ -12,85 +12,47 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 from idam.io.cloud import PointCloud
+from idam.io.names import color_names, normal_names, position_names
 
 __all__ = [
     "Numbers",
+    "check_is_binary",
     "check_size",
     "cloud_from_columns",
     "cloud_from_table",
     "finite",
     "finite_cloud",
-    "has_angles",
-    "has_positions",
     "log",
     "looks_like_colors",
     "looks_like_normals",
     "named_cloud",
-    "normal_names",
     "parse_numbers",
-    "position_names",
+    "parse_rows",
     "to_uint8",
     "unnamed_cloud",
+    "whole_as_integers",
     "without_windows_nan",
+    "words_in_lines",
 ]
 
 Numbers = NDArray[Any]
 log = logging.getLogger("idam.io")
 """What readers leave out is said here, at the level INFO; ``idam info`` shows it."""
 
-_POSITIONS = (
-    ("x", "y", "z"),
-    ("points:0", "points:1", "points:2"),
-    ("points_0", "points_1", "points_2"),
-    ("pos_x", "pos_y", "pos_z"),
-    ("position_x", "position_y", "position_z"),
-    ("coord_x", "coord_y", "coord_z"),
-    ("x_coord", "y_coord", "z_coord"),
-    ("x_coordinate", "y_coordinate", "z_coordinate"),
-    ("point_x", "point_y", "point_z"),
-)
-# survey's names: any of the first for x, with any of the second for y, with any of the third for z
-_SURVEY = (
-    ("easting", "east", "e", "rechtswert", "este"),
-    ("northing", "north", "n", "hochwert", "norte"),
-    ("height", "elevation", "elev", "altitude", "alt", "z", "h", "höhe", "hoehe", "cota"),
-)
-_ANGLES = {"lat", "latitude", "lon", "long", "lng", "longitude"}
-_COLORS = (
-    ("red", "green", "blue"),
-    ("r", "g", "b"),
-    ("rf", "gf", "bf"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-)
-_NORMALS = (
-    ("nx", "ny", "nz"),
-    ("normal_x", "normal_y", "normal_z"),
-    ("normals:0", "normals:1", "normals:2"),
-    ("normals_0", "normals_1", "normals_2"),
-)
-_UNIT = re.compile(r"\s*[\[({]\s*([^\])}]*?)\s*[\])}]\s*$|(?<=[a-z0-9])(?:_|\s*/\s*)(m|mm|cm|km|ft|in)$", re.IGNORECASE)
+MOST_COLUMNS = 16
+"""Columns that a table without names may have even with fewer rows: scanners' exports have up to a dozen."""
 
 # Where a colour or a normal may start in a table without names: x y z and a triple; x y z intensity and a triple (PTS);
 # x y z and two triples. With any other number of columns there is no telling.
 _TRIPLES = {6: (3,), 7: (4,), 9: (3, 6)}
 
 # C runtimes of Windows write 1.#QNAN, -1.#IND, 1.#INF and, rounded, 1.#R or -1.$ ; newer ones -nan(ind); Excel #N/A.
-_WINDOWS_NAN = re.compile(rb"[+-]?\d\.[#$]\w*|[+-]?nan\(\w*\)|#(?:N/A|NUM!|DIV/0!|VALUE!|REF!)", re.IGNORECASE)
-
-
-def plain_name(name: str) -> str:
-    """A column's name in small letters, without its unit and spaces: ``pos_x`` for ``Pos X [m]``."""
-    return "_".join(_UNIT.sub("", name.strip()).split()).casefold()
-
-
-def has_positions(names: Sequence[str]) -> bool:
-    """Tell whether the names of columns say where the coordinates are."""
-    return _find(names, _POSITIONS) is not None or _find_survey(names) is not None
-
-
-def has_angles(names: Sequence[str]) -> bool:
-    """Tell whether the names of columns say that coordinates are latitude and longitude."""
-    return bool(_ANGLES & {plain_name(name) for name in names})
+_WINDOWS_NAN = re.compile(
+    rb"[+-]?\d(?:\.[#$]\w*|,#(?:[QS]?NAN|IND|INF)\w*)|[+-]?nan\(\w*\)|"
+    rb"#(?:N/A|NV\b|(?:NUM|DIV/0|VALUE|REF|WERT|ZAHL|BEZUG|VALEUR|NOMBRE|VALOR)!)",
+    re.IGNORECASE,
+)
+_NUMBERS_AS_TEXT = re.compile(rb"[\s\d.eE+-]{24,}")
 
 
 def cloud_from_columns(columns: Mapping[str, Numbers]) -> PointCloud:
@@ -109,31 +71,13 @@ def named_cloud(columns: Mapping[str, Numbers]) -> PointCloud:
         InputError: there are no coordinates.
     """
     names = list(columns)
-    places = position_names(names), _find(names, _COLORS), normal_names(names)
+    places = position_names(names), color_names(names), normal_names(names)
     points, colors, normals = (
         None if found is None else np.stack([columns[name] for name in found], axis=1) for found in places
     )
     assert points is not None
     taken = {name for found in places if found for name in found}
     return _cloud(points, colors, normals, {name: columns[name] for name in names if name not in taken})
-
-
-def position_names(columns: Sequence[str]) -> Sequence[str]:
-    """Find which of the names are those of x, y and z.
-
-    Raises:
-        InputError: none are, or they have different units.
-    """
-    names = _find(columns, _POSITIONS) or _find_survey(columns)
-    if names is None:
-        if has_angles(columns):
-            raise InputError("its coordinates are degrees of latitude and longitude: project them to metres first")
-        found = ", ".join(columns)[:60] or "none"
-        raise InputError(f"has no columns x, y and z (found: {found}): export it with coordinates")
-    units = {(match[1] or match[2]).casefold() for name in names if (match := _UNIT.search(name.strip()))}
-    if len(units) > 1:
-        raise InputError(f"its coordinates have different units ({', '.join(sorted(units))}): convert them to one")
-    return names
 
 
 def cloud_from_table(table: Numbers) -> PointCloud:
@@ -146,7 +90,13 @@ def cloud_from_table(table: Numbers) -> PointCloud:
 
 
 def unnamed_cloud(table: Numbers) -> PointCloud:
-    """Find the cloud in a table (N, 3 or more) without names: coordinates, then what looks like colours or normals."""
+    """Find the cloud in a table (N, 3 or more) without names: coordinates, then what looks like colours or normals.
+
+    Raises:
+        InputError: its rows seem to be columns.
+    """
+    if table.shape[1] > max(MOST_COLUMNS, len(table)):
+        raise InputError(f"holds {len(table)} rows of {table.shape[1]:,} numbers, expected a point a row: transpose it")
     colors = normals = None
     taken = {0, 1, 2}
     for start in _TRIPLES.get(table.shape[1], ()):
@@ -208,11 +158,64 @@ def parse_numbers(text: bytes) -> NDArray[np.float64]:
     """Read all numbers of a text separated by white space, line ends included.
 
     Raises:
-        ValueError: a word is no number.
+        InputError: a word is no number.
     """
-    if b"_" in text:  # which Python takes between digits
-        raise ValueError("a number holds '_'")
-    return np.fromiter(map(float, without_windows_nan(text).split()), np.float64)
+    words = without_windows_nan(text).split()
+    try:
+        if b"_" not in text:  # which Python takes between digits
+            return np.fromiter(map(float, words), np.float64, len(words))
+    except ValueError:
+        pass
+    word = next(word for word in words if not _is_float(word)).decode("latin-1")
+    raise InputError(f"damaged: '{word[:40]}' is no number: mend it, or export the file again")
+
+
+def parse_rows(rows: Sequence[Sequence[bytes]], what: str) -> NDArray[np.float64]:
+    """Read rows of words, as many in each, as numbers (N, width).
+
+    Raises:
+        InputError: a word is no number, or the rows differ in length.
+    """
+    width = len(rows[0]) if rows else 0
+    short = next((row for row in rows if len(row) != width), None)
+    if short is not None:
+        raise InputError(f"damaged: {what} holds {len(short)} numbers, the first {width}: export it again")
+    return parse_numbers(b" ".join(word for row in rows for word in row)).reshape(len(rows), width)
+
+
+def words_in_lines(text: bytes) -> NDArray[np.int64]:
+    """Count the words of each line of a text, empty lines left out."""
+    letters = np.frombuffer(b" " + text + b"\n", np.uint8)
+    is_space = letters <= 32
+    starts = np.flatnonzero(is_space[:-1] & ~is_space[1:])
+    ends = np.flatnonzero((letters[1:] == 10) | (letters[1:] == 13))
+    counts = np.diff(np.searchsorted(starts, ends), prepend=0)
+    return counts[counts > 0]
+
+
+def whole_as_integers(values: NDArray[Any]) -> NDArray[Any]:
+    """Make integers of a column that was read as floats; one with fractions or NaN stays as it is."""
+    with np.errstate(all="ignore"):
+        integers = values.astype(np.int64)
+        return integers if (integers == values).all() else values
+
+
+def check_is_binary(body: bytes) -> None:
+    """Refuse text where a header promises bytes.
+
+    Raises:
+        InputError: it is text.
+    """
+    if _NUMBERS_AS_TEXT.fullmatch(body[:200]):
+        raise InputError("damaged: its header says binary, but numbers follow as text: export it again")
+
+
+def _is_float(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return b"_" not in word
 
 
 def without_windows_nan(text: bytes) -> bytes:
@@ -231,23 +234,6 @@ def check_size(needed: int, available: int, what: str, unit: str = "bytes") -> N
             f"cut short: its header promises {what}, at least {needed:,} {unit}, but {available:,} are there: "
             "copy or export it again"
         )
-
-
-def normal_names(names: Sequence[str]) -> Sequence[str] | None:
-    """Find which of the names are those of a normal, if any."""
-    return _find(names, _NORMALS)
-
-
-def _find(names: Sequence[str], choices: tuple[tuple[str, str, str], ...]) -> Sequence[str] | None:
-    """The three names, as the file spells them, that are one of the choices."""
-    plain = {plain_name(name): name for name in names}
-    return next(([plain[each] for each in choice] for choice in choices if all(map(plain.__contains__, choice))), None)
-
-
-def _find_survey(names: Sequence[str]) -> Sequence[str] | None:
-    plain = {plain_name(name): name for name in names}
-    found = [next((plain[each] for each in choice if each in plain), "") for choice in _SURVEY]
-    return found if all(found) else None
 
 
 def looks_like_normals(triple: Numbers) -> bool:

@@ -32,6 +32,7 @@ _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
+_GRID = ("rowIndex", "columnIndex")
 _STATES = ("cartesianInvalidState", "sphericalInvalidState")
 
 
@@ -51,11 +52,13 @@ def read(path: Path) -> list[Placed]:
     try:
         image = pye57.libe57.ImageFile(str(path), "r")  # pye57.E57 would delete a file that it cannot read
     except Exception as error:
-        raise InputError(f"damaged, or not E57 ({one_line(error)}): export it again") from error
+        raise InputError(f"damaged, or not E57 ({_reason(error)}): export it again") from error
     try:
         root = image.root()
         scans = root["data3D"] if root.isDefined("data3D") else []
         found = [scan for number in range(len(scans)) if (scan := _read_scan(image, scans[number], number + 1))]
+    except pye57.libe57.E57Exception as error:
+        raise InputError(f"damaged ({_reason(error)}): copy or export it again") from error
     finally:
         image.close()
     if not found:
@@ -69,7 +72,7 @@ def encode(cloud: PointCloud) -> bytes:
 
 
 def encode_scans(scans: Sequence[Placed]) -> bytes:
-    """Encode scans, each with its pose (4, 4), colours and intensity; coordinates are float32 around the scan's centre.
+    """Encode scans, each with its pose (4, 4), colours, intensity, rows and columns; coordinates are float32.
 
     Raises:
         MissingDependencyError: pye57 is not installed.
@@ -89,6 +92,8 @@ def encode_scans(scans: Sequence[Placed]) -> bytes:
                     data |= dict(zip(_COLORS, cloud.colors.T, strict=True))
                 if "intensity" in cloud.attributes:
                     data["intensity"] = cloud.attributes["intensity"].astype(np.float32)
+                if set(_GRID) <= set(cloud.attributes):
+                    data |= {axis: cloud.attributes[axis].astype(np.uint16) for axis in _GRID}
                 file.write_scan_raw(
                     {name: np.ascontiguousarray(values) for name, values in data.items()},
                     name=f"scan {number}",
@@ -172,6 +177,10 @@ def _colors(colors: Numbers, points: Any, scan: Any) -> NDArray[np.uint8]:
     if not highest > 0 or colors.max(initial=0) > highest:
         highest = 255.0 if colors.max(initial=0) <= 255 else 65535.0
     return np.round(np.nan_to_num(colors) * (255 / highest)).clip(0, 255).astype(np.uint8)
+
+
+def _reason(error: Exception) -> str:
+    return one_line(error).partition(" ****")[0]  # libE57 says everything twice
 
 
 def _pose(scan: Any) -> NDArray[np.float64]:

@@ -333,7 +333,8 @@ def _faults_of(path: StrPath, suffix: str) -> Iterator[None]:
         with np.errstate(all="ignore"):  # of damaged numbers
             yield
     except InputError as error:
-        message = str(error) if len(str(error)) <= LONGEST else textwrap.shorten(str(error), LONGEST)
+        message = "".join(letter if letter.isprintable() else "?" for letter in str(error))
+        message = message if len(message) <= LONGEST else textwrap.shorten(message, LONGEST)
         raise error if message.startswith(f"{path}: ") else InputError(f"{path}: {message}") from error
     except MissingDependencyError:
         raise

@@ -22,16 +22,20 @@ import numpy as np
 from idam import rigid
 from idam.errors import InputError, MissingDependencyError
 from idam.io.cloud import PointCloud
-from idam.io.columns import Numbers, check_size, cloud_from_columns, normal_names
+from idam.io.columns import Numbers, check_size, cloud_from_columns
+from idam.io.copc import coarse_points, is_copc
 from idam.io.files import StrPath, check_unpacked_size, one_line, replacing, silenced
+from idam.io.names import normal_names
 
-__all__ = ["MOST_POINTS", "check_installed", "encode", "move", "read"]
+__all__ = ["COPC_POINTS", "MOST_POINTS", "check_installed", "encode", "move", "read"]
 
 log = logging.getLogger("idam.io")
 
 MOST_POINTS = 10_000_000
 """Points past which a file is thinned while it is read, to every second, third and so on: registration sees 10^4 to
 10^6 of them, and memory stays bounded (measured in docs/formats.md)."""
+COPC_POINTS = 2_000_000
+"""Points up to which levels of a COPC file are read: they lie evenly, so fewer do, and only they are unpacked."""
 
 _OWN = "_"  # behind the name of an extra dimension where LAS has one of that name, of other numbers
 _CHUNK = 1_000_000
@@ -47,7 +51,8 @@ _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 def read(path: Path) -> PointCloud:
     """Read the points of a LAS or LAZ file, scaled and offset to float64, with their colours if it has them.
 
-    What all points have as 0 is left out. Of more than :data:`MOST_POINTS`, every second, third and so on is read.
+    What all points have as 0 is left out. Of more than :data:`MOST_POINTS`, every second, third and so on is read; of a
+    COPC file with more than :data:`COPC_POINTS`, the first levels of its octree.
 
     Raises:
         InputError: the file is damaged.
@@ -57,7 +62,17 @@ def read(path: Path) -> PointCloud:
     with _opened(path) as reader:
         count = reader.header.point_count
         step = max(1, math.ceil(count / MOST_POINTS))
-        if step > 1:
+        if count > COPC_POINTS and is_copc(reader.header):
+            points, depth = coarse_points(path, COPC_POINTS)
+            log.warning(
+                "%s: reading %s of its %s points, %d levels of its octree",
+                path,
+                f"{len(points):,}",
+                f"{count:,}",
+                depth,
+            )
+            every = [_columns(points)]
+        elif step > 1:
             log.warning("%s: reading every %d. of its %s points", path, step, f"{count:,}")
             every = _every(reader, step)
         else:

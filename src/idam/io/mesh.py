@@ -101,7 +101,7 @@ def decode_stl(data: bytes) -> Mesh | PointCloud:
         end = 84 + 50 * struct.unpack_from("<I", data, 80)[0]
         check_size(end, len(data), "binary STL triangles")
         data = data[:end]
-    return _joined([_load(data, "stl")])
+    return _joined(_load(data, "stl"))
 
 
 def encode_stl(mesh: Mesh) -> bytes:
@@ -124,15 +124,7 @@ def encode_stl(mesh: Mesh) -> bytes:
 
 def decode_glb(data: bytes) -> Mesh | PointCloud:
     """Read the meshes and points of a binary glTF file, each where its scene places it."""
-    scene = _load(data, "glb")
-    placed = []
-    for name in scene.graph.nodes_geometry:
-        transform, geometry = scene.graph[name]
-        part = scene.geometry[geometry].copy()
-        placed.append(part.apply_transform(transform))
-    if not placed:
-        raise InputError("holds no points: export it again")
-    return _joined(placed)
+    return _joined(_load(data, "glb"))
 
 
 def encode_glb(mesh: Mesh) -> bytes:
@@ -155,14 +147,24 @@ def coordinate_type(points: NDArray[np.float64]) -> str:
     return "f8" if rounding > 1e-6 * extent else "f4"
 
 
-def _load(data: bytes, file_type: str) -> Any:
+def _load(data: bytes, file_type: str) -> list[Any]:
+    """The meshes and clouds of a file, each where its scene places it."""
     import trimesh
 
     with silenced("trimesh"):
-        return trimesh.load(io.BytesIO(data), file_type=file_type, process=False)
+        loaded: Any = trimesh.load(io.BytesIO(data), file_type=file_type, process=False)
+    if not isinstance(loaded, trimesh.Scene):
+        return [loaded]
+    placed = []
+    for name in loaded.graph.nodes_geometry:
+        transform, geometry = loaded.graph[name]
+        placed.append(loaded.geometry[geometry].copy().apply_transform(transform))
+    return placed
 
 
 def _joined(parts: list[Any]) -> Mesh | PointCloud:
+    if not parts:
+        raise InputError("holds no points: export it again")
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)], dtype=np.int64)
     vertices = np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False) if hasattr(part, "faces")]

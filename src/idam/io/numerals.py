@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 
-__all__ = ["find_marks", "is_number", "parse_column", "strange"]
+__all__ = ["find_marks", "has_decimal_commas", "is_number", "parse_column", "strange"]
 
-_NUMBER = re.compile(r"[+-]?(?=[.,]?\d)[\d.,]+(?:e[+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?(?=[.,]?\d)[\d.,]+(?:[ed][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_FORTRAN = re.compile(r"(?<=[\d.,])d(?=[+-]?\d)")  # 1.5D+02
 _MISSING = {"", "na", "n/a", "<na>", "null", "none", "-"}
 _GAPS = re.compile("(?<=\\d)[ \u00a0\u202f'\u2019](?=\\d{3}(?!\\d))")  # between thousands
 
@@ -47,7 +49,7 @@ def find_marks(fields: Iterable[str], commas_separate: bool) -> tuple[str, str]:
     """
     comma, dot = set(), set()
     for word in fields:
-        word = _GAPS.sub("", word.strip()).casefold()
+        word = _plain(word)
         if "," in word:
             comma.add(_role(word, ",", "."))
         if "." in word:
@@ -68,9 +70,19 @@ def find_marks(fields: Iterable[str], commas_separate: bool) -> tuple[str, str]:
 
 def parse_column(fields: Sequence[str], decimal: str, thousands: str) -> NDArray[np.float64]:
     """Read numbers with these marks; a missing one becomes NaN."""
-    words = (_GAPS.sub("", word.strip()).casefold() for word in fields)
+    words = map(_plain, fields)
     plain = ("nan" if word in _MISSING else word.replace(thousands, "").replace(decimal, ".") for word in words)
     return np.fromiter(map(float, plain), np.float64, len(fields))
+
+
+def has_decimal_commas(line: str) -> bool:
+    """Whether the words of a line are numbers, those with a comma having a decimal one."""
+    return all(_DECIMAL_COMMA.fullmatch(word) or (is_number(word) and "," not in word) for word in line.split())
+
+
+def _plain(word: str) -> str:
+    """A number in small letters, without gaps between thousands, and with e before its exponent."""
+    return _FORTRAN.sub("e", _GAPS.sub("", word.strip()).casefold())
 
 
 def _role(word: str, mark: str, other: str) -> str:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from idam import rigid
 from idam.errors import InputError
 from idam.io.cloud import Mesh, PointCloud
-from idam.io.columns import Numbers, to_uint8
+from idam.io.columns import Numbers, parse_rows, to_uint8, without_windows_nan
 from idam.io.mesh import mesh_or_cloud, triangles
 
 __all__ = ["decode", "encode", "move"]
@@ -38,7 +38,7 @@ def decode(data: bytes) -> Mesh | PointCloud:
         raise InputError("holds no points: export it again")
     points, colors = _points_and_colors(vertices)
     given = not polygons and len(normals) == len(points) and all(len(words) == 3 for words in normals)
-    cloud = PointCloud(points, colors, np.array(normals).astype(np.float64) if given else None)
+    cloud = PointCloud(points, colors, parse_rows(normals, "a normal") if given else None)
     return mesh_or_cloud(cloud, triangles([polygon for polygon in polygons if len(polygon) > 2]))
 
 
@@ -67,7 +67,7 @@ def move(data: bytes, transformation: rigid.Array) -> bytes:
     words = [line.split() for line in lines]
     for key, translation in ((b"v", transformation[:3, 3]), (b"vn", np.zeros(3))):
         rows = [row for row, each in enumerate(words) if each[:1] == [key]]
-        given = np.array([words[row][1:4] for row in rows]).astype(np.float64).reshape(-1, 3)
+        given = parse_rows([words[row][1:4] for row in rows], "a line").reshape(-1, 3)
         weights = np.ones(len(rows))
         if key == b"v":
             weights = np.array([float(words[row][4]) if len(words[row]) in (5, 8) else 1.0 for row in rows])
@@ -78,18 +78,23 @@ def move(data: bytes, transformation: rigid.Array) -> bytes:
 
 
 def _lines(data: bytes) -> list[bytes]:
-    return data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
+    return (
+        without_windows_nan(data.removeprefix(b"\xef\xbb\xbf"))
+        .replace(b"\\\r\n", b" ")
+        .replace(b"\\\n", b" ")
+        .splitlines()
+    )
 
 
 def _points_and_colors(vertices: list[list[bytes]]) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     width = len(vertices[0])
     if {len(words) for words in vertices} <= {3, 4}:
-        rows = np.array([words if len(words) == 4 else [*words, b"1"] for words in vertices]).astype(np.float64)
+        rows = parse_rows([words if len(words) == 4 else [*words, b"1"] for words in vertices], "a vertex")
         with np.errstate(all="ignore"):
             return rows[:, :3] / rows[:, 3:], None
     if width not in (6, 7) or any(len(words) != width for words in vertices):
         raise InputError("damaged: its vertices differ in how many numbers they hold: export it again")
-    rows = np.array(vertices).astype(np.float64)
+    rows = parse_rows(vertices, "a vertex")
     if width == 7:
         if not (rows[:, 3] == 1).all():
             raise InputError("its vertices hold 7 numbers: write x y z red green blue")

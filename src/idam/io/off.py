@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from idam import rigid
 from idam.errors import InputError
 from idam.io.cloud import Mesh, PointCloud
-from idam.io.columns import check_size, to_uint8
+from idam.io.columns import check_size, parse_rows, to_uint8, without_windows_nan
 from idam.io.mesh import mesh_or_cloud, triangles
 
 __all__ = ["decode", "encode", "move"]
@@ -27,7 +27,9 @@ def decode(data: bytes) -> Mesh | PointCloud:
     lines, at, (vertices, faces), (_, has_colors, has_normals, has_weight) = _parse(data)
     given = [lines[at + row].split() for row in range(vertices)]
     width = 3 + has_weight + 3 * has_normals
-    numbers = np.array([words[:width] for words in given]).astype(np.float64)
+    numbers = parse_rows([words[:width] for words in given], "a vertex")
+    if numbers.shape[1] != width:
+        raise InputError(f"damaged: its vertices hold {numbers.shape[1]} numbers, expected {width}: export it again")
     points = numbers[:, :3] / numbers[:, 3:4] if has_weight else numbers[:, :3]
     normals = numbers[:, 3 + has_weight : width] if has_normals else None
     polygons = []
@@ -76,7 +78,7 @@ def move(data: bytes, transformation: rigid.Array) -> bytes:
 
 def _parse(data: bytes) -> tuple[list[bytes], int, tuple[int, int], tuple[bool, bool, bool, bool]]:
     """The lines of a file less comments, where vertices start, how many there are and faces, and what each holds."""
-    lines = [line for each in data.splitlines() if (line := each.partition(b"#")[0].strip())]
+    lines = [line for each in without_windows_nan(data).splitlines() if (line := each.partition(b"#")[0].strip())]
     first = lines[0].split() if lines else []
     kind = _KEYWORD.fullmatch(first[0]) if first else None
     if kind is None and not (len(first) == 3 and all(word.isdigit() for word in first)):
@@ -96,6 +98,6 @@ def _parse(data: bytes) -> tuple[list[bytes], int, tuple[int, int], tuple[bool, 
 
 def _colors(words: list[list[bytes]]) -> NDArray[np.uint8]:
     """Colours written as 0 to 255 or as fractions, with or without an alpha."""
-    colors = np.array([each[:3] for each in words]).astype(np.float64)
+    colors = parse_rows([each[:3] for each in words], "a colour")
     whole = all(b"." not in word for each in words for word in each[:3])
     return to_uint8(colors.astype(np.int64) if whole else colors)

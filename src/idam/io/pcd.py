@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 
 from idam.errors import InputError
 from idam.io.cloud import PointCloud
-from idam.io.columns import check_size, cloud_from_columns, log, parse_numbers
+from idam.io.columns import (
+    check_is_binary,
+    check_size,
+    cloud_from_columns,
+    log,
+    parse_numbers,
+    whole_as_integers,
+    without_windows_nan,
+    words_in_lines,
+)
 from idam.io.files import check_unpacked_size
 from idam.io.mesh import coordinate_type
 
@@ -97,21 +106,28 @@ def _parse_header(text: str) -> _Header:
         kinds = [{"F": "f", "I": "i", "U": "u"}[kind] for kind in entries["TYPE"]]
         types = [np.dtype(f"<{kind}{int(size)}") for kind, size in zip(kinds, entries["SIZE"], strict=True)]
         counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
-        points = int(entries["POINTS"][0]) if "POINTS" in entries else _product(entries["WIDTH"] + entries["HEIGHT"])
+        size = [int(entries[name][0]) for name in ("WIDTH", "HEIGHT") if name in entries]
+        points = int(entries["POINTS"][0]) if "POINTS" in entries else size[0] * size[1]
     except (KeyError, IndexError, ValueError, TypeError) as error:
         raise InputError("damaged: its header lacks FIELDS, SIZE, TYPE or POINTS: export it again") from error
     if not len(names) == len(types) == len(counts) or min(counts, default=0) < 1 or points < 0:
         raise InputError("damaged: FIELDS, SIZE, TYPE and COUNT in its header do not agree: export it again")
+    if len(size) == 2 and size[0] * size[1] != points:
+        raise InputError(
+            f"its header says {points:,} points, but WIDTH {size[0]} and HEIGHT {size[1]}: correct one of them"
+        )
+    if len(set(names) - {"_"}) + names.count("_") < len(names):
+        raise InputError("two of its FIELDS have the same name: rename one")
     return _Header(names, types, counts, points)
-
-
-def _product(numbers: list[str]) -> int:
-    width, height = map(int, numbers)
-    return width * height
 
 
 def _read_ascii(header: _Header, body: bytes) -> list[NDArray[Any]]:
     row = sum(header.counts)
+    body = without_windows_nan(body)
+    widths = words_in_lines(body)[: header.points]
+    if (widths != row).any():
+        odd = int(widths[widths != row][0])
+        raise InputError(f"damaged: a line of {odd} numbers, where its FIELDS and COUNT say {row}: export it again")
     table = parse_numbers(body)
     check_size(header.points * row, len(table), f"{header.points:,} points", "numbers")
     table = table[: header.points * row].reshape(header.points, row)
@@ -120,11 +136,12 @@ def _read_ascii(header: _Header, body: bytes) -> list[NDArray[Any]]:
 
 
 def _as_declared(values: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Turn numbers read as doubles into the integers they are declared as; a float keeps the digits of the text."""
-    return values.astype(np.int64).astype(kind) if kind.kind != "f" else values
+    """Turn numbers read as doubles into integers if they are declared so; a float keeps the digits of the text."""
+    return values if kind.kind == "f" else whole_as_integers(values)
 
 
 def _read_binary(header: _Header, body: bytes) -> list[NDArray[Any]]:
+    check_is_binary(body)
     _check_binary_size(header, len(body))
     fields = zip(header.types, header.counts, strict=True)
     layout = np.dtype([(f"{index}", kind, (count,)) for index, (kind, count) in enumerate(fields)])

@@ -14,15 +14,17 @@ from idam import rigid
 from idam.errors import InputError
 from idam.io.cloud import Mesh, PointCloud
 from idam.io.columns import (
+    check_is_binary,
     check_size,
     finite,
     named_cloud,
-    normal_names,
     parse_numbers,
-    position_names,
+    whole_as_integers,
     without_windows_nan,
+    words_in_lines,
 )
 from idam.io.mesh import coordinate_type, fan, mesh_or_cloud, triangles
+from idam.io.names import normal_names, position_names
 
 __all__ = ["decode", "encode", "move"]
 
@@ -110,6 +112,12 @@ def move(data: bytes, transformation: rigid.Array) -> bytes:
         turned = np.stack([vertex[name] for name in normals], axis=1) @ transformation[:3, :3].T
         vertex |= dict(zip(normals, turned.T, strict=True))
     for element in elements:
+        for place, each in enumerate(element.properties):
+            if (
+                each.declared.kind in "iu"
+                and getattr(columns[element.name][each.name], "dtype", each.declared).kind == "f"
+            ):
+                element.properties[place] = replace(each, declared=np.dtype("<f8"))  # fractions in a text
         if element.name == "vertex":
             for place, each in enumerate(element.properties):
                 if each.name in names and each.declared != np.float64:
@@ -122,23 +130,37 @@ def move(data: bytes, transformation: rigid.Array) -> bytes:
 def _read(data: bytes) -> tuple[list[_Element], dict[str, dict[str, Column]]]:
     """Read all elements of a file, and the columns of each."""
     elements, is_ascii, offset = _parse_header(data)
+    body = data[offset:]
     if not is_ascii:
+        check_is_binary(body)
         return elements, _read_elements(data, offset, elements, "bytes")[0]
-    body = without_windows_nan(
-        data[offset:]
-    )  # one decoder for both: text becomes a file in which every type is a double
+    body = without_windows_nan(body)  # one decoder for both: text becomes a file in which every type is a double
     fault = InputError("damaged: it holds more numbers than its header says: export it again")
-    numbers = parse_numbers(body).tobytes()
-    try:
-        columns, end = _read_elements(numbers, 0, elements, "numbers")
-        if end == len(numbers):
-            return elements, columns
-    except InputError as error:
-        fault = error
+    if not _lines_differ(body, elements):
+        numbers = parse_numbers(body).tobytes()
+        try:
+            columns, end = _read_elements(numbers, 0, elements, "numbers")
+            if end == len(numbers):
+                return elements, columns
+        except InputError as error:
+            fault = error
     try:  # surplus numbers: then what counts is where the lines end
         return elements, _read_elements(_first_of_lines(body, elements).tobytes(), 0, elements, "numbers")[0]
     except (InputError, ValueError, IndexError):
         raise fault from None
+
+
+def _lines_differ(body: bytes, elements: list[_Element]) -> bool:
+    """Whether there is a line a row, but lines of vertices differ in how many numbers they hold."""
+    words = words_in_lines(body)
+    if len(words) != sum(element.count for element in elements):
+        return False
+    at = 0
+    for element in elements:
+        if element.name == "vertex" and all(each.count_type is None for each in element.properties):
+            return bool((words[at : at + element.count] != len(element.properties)).any())
+        at += element.count
+    return False
 
 
 def _read_elements(
@@ -239,6 +261,9 @@ def _parse_header(data: bytes) -> tuple[list[_Element], bool, int]:
                 elements[-1].properties.append(_property(name, order, kind))
             case _:
                 raise InputError(f"damaged: its header has the line '{line.strip()[:60]}': export it again")
+    for element in elements:
+        if len({each.name for each in element.properties}) < len(element.properties):
+            raise InputError(f"damaged: its header names a property of '{element.name}' twice: export it again")
     if order is None:
         raise InputError("damaged: its header has no 'format' line: export it again")
     return elements, order == "", _start_of_data(data, end.end(), line_end[1])
@@ -314,7 +339,7 @@ def _named(columns: Sequence[Column], element: _Element) -> dict[str, Column]:
     named: dict[str, Column] = {}
     for each, column in zip(element.properties, columns, strict=True):
         if each.declared.kind in "iu" and isinstance(column, np.ndarray) and column.dtype.kind == "f":
-            column = column.astype(np.int64)
+            column = whole_as_integers(column)
         named[each.name] = column
     return named
 

@@ -2,56 +2,34 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from idam.errors import InputError
 from idam.io.cloud import PointCloud, joined
-from idam.io.columns import (
-    Numbers,
-    check_size,
-    cloud_from_columns,
-    cloud_from_table,
-    has_angles,
-    has_positions,
-    log,
-    looks_like_colors,
-    looks_like_normals,
-    position_names,
-    without_windows_nan,
-)
-from idam.io.numerals import find_marks, is_number, parse_column, strange
+from idam.io.columns import Numbers, check_size, cloud_from_columns, cloud_from_table, log, without_windows_nan
+from idam.io.header import COMMA_BY_SPACE, Header, names_for, parse_header, split, without_comment
+from idam.io.names import position_names
+from idam.io.numerals import find_marks, has_decimal_commas, is_number, parse_column, strange
+from idam.io.readings import counts, refuse_two_readings
 
 __all__ = ["decode", "decode_pts", "encode_csv", "encode_pts", "encode_xyz"]
 
 _BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
-_SLASHES = re.compile(r"(^|[ \t,;])//", re.MULTILINE)
-_COMMENT = re.compile(r'("[^"]*")|(?:^|(?<=[\s,;]))#.*')
-_COMMA_BY_SPACE = re.compile(r",\s|\s,")
-_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+# what starts a comment besides #: // anywhere, and in front of a line % or !, or the only semicolon of the line
+_COMMENTS = re.compile(r"(^|[ \t,;])//|^[ \t]*(?:[%!]|;(?=[^;\r\n]*$))", re.MULTILINE)
 _BEFORE_EMPTY_FIELD = re.compile(r",(?=[ \t]*(?:,|$))", re.MULTILINE)
-_IN_BRACKETS = re.compile(r"\s*([\[({][^\])}]*[\])}])")
-_NAME_THEM = "name the columns in a first line, such as x y z"
-
-
-@dataclass(frozen=True)
-class _Header:
-    names: list[str] | None
-    from_comment: bool
-    count: int | None
-    first: int  # the line that holds the first point
 
 
 def decode(data: bytes) -> PointCloud:
     """Read a text file with a point a line: coordinates, and what the header names or the columns look like.
 
-    Columns stand apart by white space, commas or semicolons; ``#`` and ``//`` start a comment. The names of columns may
-    stand in the first line, or in a comment before the first number, and the number of points before the first point.
-    Columns of text are left out.
+    Columns stand apart by white space, commas, semicolons or bars; ``#``, ``//``, ``%`` and ``!`` start a comment. The
+    names of columns may stand in the first line, or in a comment before the first number, and the number of points
+    before the first point. Columns of text are left out.
 
     Raises:
         InputError: a line is no point or can be read in two ways, or there are no finite coordinates.
@@ -65,9 +43,9 @@ def decode_pts(data: bytes) -> list[PointCloud]:
 
 
 def encode_xyz(cloud: PointCloud) -> bytes:
-    """Write lines of x y z, then red green blue, then the normal, then, under a comment with the names, all else."""
+    """Write lines of x y z; further columns (colours, the normal, all else) under a comment with their names."""
     columns = _columns(cloud)
-    names = "# " + " ".join(map(_one_word, columns)) + "\n" if cloud.attributes else ""
+    names = "# " + " ".join(map(_one_word, columns)) + "\n" if len(columns) > 3 else ""
     return names.encode() + _lines(columns.values(), " ")
 
 
@@ -90,88 +68,49 @@ def encode_pts(cloud: PointCloud) -> bytes:
 
 def _decode_blocks(data: bytes) -> list[PointCloud]:
     lines = _split_lines(data)
-    header = _parse_header(lines)
+    header = parse_header(lines)
     spans = list(_spans(lines, header))
     return [_decode_lines(lines, start, stop, header) for start, stop in spans]
 
 
 def _split_lines(data: bytes) -> list[str]:
-    encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), "utf-8")
-    if b"\0" in data and encoding != "utf-16":
+    encoding = _encoding(data)
+    if encoding.startswith("utf-16"):
+        text = without_windows_nan(data.decode(encoding).encode()).decode()
+    elif b"\0" in data:
         raise InputError("not a text file (it holds zero bytes): check what it is")
-    if encoding != "utf-16":
+    else:
         data = without_windows_nan(data)
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-    return _SLASHES.sub(r"\1#", text.replace("\r\n", "\n").replace("\r", "\n")).split("\n")
+        try:
+            text = data.decode(encoding)
+        except UnicodeDecodeError:
+            text = data.decode("latin-1")
+    text = text.rstrip("\x1a").replace("\u2212", "-")  # the end of a file of DOS, and the typographic minus
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if any(mark in text for mark in ("//", "%", "!", ";")):  # most files have none, and the search is slow
+        text = _COMMENTS.sub(r"\1#", text)
+    lines = text.splitlines()
+    return _without_bars(lines) if "|" in text else lines
 
 
-def _parse_header(lines: list[str]) -> _Header:
-    """Find the names of columns and the number of points, if given, and which line holds the first point."""
-    names = count = None
-    from_comment = False
-    for index, line in enumerate(lines):
-        is_comment = line.lstrip().startswith("#")
-        line = line.lstrip(" \t#") if is_comment else _without_comment(line)
-        words = _words(line)
-        if not any(words) or (index == 0 and line.startswith("sep=")):  # which tells Excel the separator
-            continue
-        numbers = sum(map(is_number, words))
-        if is_comment:
-            header = _names(line)
-            if has_positions(header):
-                names, from_comment = header, True
-        elif len(words) == 1 and count is None and words[0].isdecimal():
-            count = int(words[0])
-        elif numbers < len(words) and (numbers < 3 or has_positions(_names(line))):
-            names, from_comment = _names(line), False
-            if not has_positions(names) and not has_angles(names):
-                raise InputError(f"line {index + 1} is neither numbers nor names of columns: write lines of x y z")
-        else:
-            return _Header(names, from_comment, count, index)
-    raise InputError("holds no points: export it again")
+def _encoding(data: bytes) -> str:
+    known = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), None)
+    if known is not None:
+        return known
+    if b"\0" not in data[:2]:
+        return "utf-8"
+    return "utf-16-be" if data.startswith(b"\0") else "utf-16-le"  # of an ASCII character, one byte is 0
 
 
-def _names(line: str) -> list[str]:
-    """Split the names of columns, each with its unit."""
-    glued = _IN_BRACKETS.sub(lambda match: match[1].replace(" ", "").replace(",", "."), line)
-    words = _words(glued)
-    if "\t" in glued and not has_positions(words):
-        words = [word.strip(" \"'") for word in glued.split("\t")]
-    return words
+def _without_bars(lines: list[str]) -> list[str]:
+    """Put semicolons where all columns stand apart by bars, as databases print them."""
+    rows = [line for line in lines if line.strip() and not line.startswith("#")]
+    if not all("|" in line and ";" not in line for line in rows):
+        return lines
+    return [line.strip(" \t|").replace("|", ";") for line in lines]
 
 
-def _words(line: str) -> list[str]:
-    """Split a line; an empty field between commas counts, so that names and numbers stay in step."""
-    separator = " "
-    if ";" in line:
-        separator = ";"
-    elif "," in line and not _has_decimal_commas(line):
-        separator = "\t" if "\t" in line and not _COMMA_BY_SPACE.search(line) else ","
-    words = _split(line, separator)
-    while words and not words[-1]:
-        words.pop()
-    return words
-
-
-def _without_comment(line: str) -> str:
-    return _COMMENT.sub(lambda match: match[1] or "", line)
-
-
-def _split(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        line = " ".join(line.split("\t")).strip()
-    words = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-    return [word.strip() for word in words]
-
-
-def _has_decimal_commas(line: str) -> bool:
-    return all(_DECIMAL_COMMA.fullmatch(word) or (is_number(word) and "," not in word) for word in line.split())
-
-
-def _spans(lines: list[str], header: _Header) -> Iterator[tuple[int, int]]:
+def _spans(lines: list[str], header: Header) -> Iterator[tuple[int, int]]:
     """Find the first and past-the-last line of each scan; without counts, all lines are one."""
     if header.count is None:
         yield header.first, len(lines)
@@ -193,7 +132,7 @@ def _spans(lines: list[str], header: _Header) -> Iterator[tuple[int, int]]:
         place, count = place + 1, int(word)
 
 
-def _decode_lines(lines: list[str], start: int, stop: int, header: _Header) -> PointCloud:
+def _decode_lines(lines: list[str], start: int, stop: int, header: Header) -> PointCloud:
     block = lines[start:stop]
     has_quotes = any('"' in line for line in block)
     table = None if has_quotes else _plain_table(block)
@@ -202,9 +141,9 @@ def _decode_lines(lines: list[str], start: int, stop: int, header: _Header) -> P
     while table.shape[1] > 3 and np.isnan(table[:, -1]).all():  # a comma at the end of each line
         table = table[:, :-1]
     _check_width(table.shape[1])
-    names = _names_for(header, table.shape[1], _counts(table[:, 0]))
+    names = names_for(header, table.shape[1], counts(table[:, 0]))
     if names is None:
-        _refuse_two_readings(table, commas="," in block[0] and ";" not in block[0], text="\n".join(block[:10_000]))
+        refuse_two_readings(table, commas="," in block[0] and ";" not in block[0], lines=block[:10_000])
         return cloud_from_table(table)
     return cloud_from_columns(dict(zip(names, table.T[-len(names) :], strict=True)))
 
@@ -215,12 +154,12 @@ def _plain_table(lines: list[str]) -> Numbers | None:
     delimiter = None
     if ";" in first or "," in first:
         text = "\n".join(["", *lines])
-        has_decimal_commas = ";" in first or _has_decimal_commas(first)
-        if has_decimal_commas and "," in text:
+        commas_are_decimal = ";" in first or has_decimal_commas(first)
+        if commas_are_decimal and "," in text:
             if "." in text:
                 return None
             text = text.replace(",", ".")
-        if ";" in first or not has_decimal_commas:
+        if ";" in first or not commas_are_decimal:
             delimiter = ","
             text = _BEFORE_EMPTY_FIELD.sub(",nan", text.replace(";", ",")).replace("\n,", "\nnan,")
         lines = text.split("\n")[1:]
@@ -230,11 +169,11 @@ def _plain_table(lines: list[str]) -> Numbers | None:
         return None
 
 
-def _decode_fields(lines: list[str], start: int, stop: int, header: _Header) -> PointCloud:
+def _decode_fields(lines: list[str], start: int, stop: int, header: Header) -> PointCloud:
     """Read rows with quotes, text or unusual numbers: slower, field by field."""
-    numbered = [(at + 1, line) for at in range(start, stop) if (line := _without_comment(lines[at]).strip())]
+    numbered = [(at + 1, line) for at in range(start, stop) if (line := without_comment(lines[at]).strip())]
     separator = _separator([line for _, line in numbered])
-    rows = [_split(line, separator) for _, line in numbered]
+    rows = [split(line, separator) for _, line in numbered]
     widths = [len(row) for row in rows]
     if separator != " " and all(not row[-1] for row in rows):  # a separator at the end of each line
         rows = [row[:-1] for row in rows]
@@ -247,7 +186,7 @@ def _decode_fields(lines: list[str], start: int, stop: int, header: _Header) -> 
             )
     columns = [list(column) for column in zip(*rows, strict=True)]
     is_name = all(line.startswith('"') for _, line in numbered) or all(not is_number(word) for word in columns[0])
-    names = _names_for(header, len(columns), is_name or _counts_up(columns[0]))
+    names = names_for(header, len(columns), is_name or _counts_up(columns[0]))
     if names is not None:
         columns = columns[-len(names) :]
     faults = [strange(column) for column in columns]
@@ -270,7 +209,7 @@ def _decode_fields(lines: list[str], start: int, stop: int, header: _Header) -> 
         return cloud_from_columns({names[place]: values for place, values in numbers.items()})
     table = np.stack([*numbers.values()], axis=1)
     _check_width(table.shape[1])
-    _refuse_two_readings(table, commas=separator == ",", text="\n".join(line for _, line in numbered[:10_000]))
+    refuse_two_readings(table, commas=separator == ",", lines=[line for _, line in numbered[:10_000]])
     return cloud_from_table(table)
 
 
@@ -285,38 +224,11 @@ def _separator(lines: list[str]) -> str:
     outside = [re.sub(r'"[^"]*"', '""', line) for line in lines]
     if any(";" in line for line in outside):
         return ";"
-    if all("\t" in line for line in outside) and not any(map(_COMMA_BY_SPACE.search, outside)):
+    if all("\t" in line for line in outside) and not any(map(COMMA_BY_SPACE.search, outside)):
         return "\t"
-    if any("," in line for line in outside) and not all(map(_has_decimal_commas, outside)):
+    if any("," in line for line in outside) and not all(map(has_decimal_commas, outside)):
         return ","
     return " "
-
-
-def _names_for(header: _Header, width: int, first_is_name: bool) -> list[str] | None:
-    """The names of the last columns of so many, or None if there are none; one more column may be the rows' names."""
-    names = header.names
-    if names is None:
-        return None
-    if len({name.casefold() for name in names if name}) < len([name for name in names if name]):
-        raise InputError("two of its columns have the same name: rename one in its first line")
-    if len(names) == width:
-        return [name or f"column_{place + 1}" for place, name in enumerate(names)]
-    if header.from_comment:
-        if _says_xyz(names, width):
-            return None
-    elif width == len(names) + 1 and first_is_name:
-        return names
-    raise InputError(
-        f"its first line names {len(names)} columns but its rows hold {width}: name every column, "
-        "and write numbers with decimal points"
-    )
-
-
-def _says_xyz(words: list[str], width: int) -> bool:
-    """Whether a comment that does not name each column says that the coordinates come first."""
-    plain = [word.strip(",.:;()").casefold() for word in words]
-    at = next((at for at in range(len(plain)) if plain[at : at + 3] == ["x", "y", "z"]), None)
-    return at == 0 or (at is not None and width == 3)
 
 
 def _check_width(width: int) -> None:
@@ -324,43 +236,8 @@ def _check_width(width: int) -> None:
         raise InputError(f"its lines hold {width} numbers, expected x y z: export it with coordinates")
 
 
-def _counts(column: Numbers) -> bool:
-    """Whether a column numbers the rows from 0 or from 1."""
-    return bool(column[0] in (0, 1) and (column == column[0] + np.arange(len(column))).all())
-
-
 def _counts_up(fields: list[str]) -> bool:
-    return all(word.isdecimal() for word in fields) and _counts(np.array(fields, np.float64))
-
-
-def _refuse_two_readings(table: Numbers, commas: bool, text: str) -> None:
-    """Refuse columns without names that may well not be x y z."""
-    rows, width = table.shape
-    if rows >= 3 and width >= 4 and _counts(table[:, 0]):
-        raise InputError(f"its first column seems to number the rows, not to be x: {_NAME_THEM}, such as number x y z")
-    if rows >= 3 and width >= 5 and _is_grid(table):
-        raise InputError(
-            "its first two columns seem to be a scanner's rows and columns: name the columns in a first line, "
-            "such as row column x y z, or x y z and what follows"
-        )
-    if commas and width >= 5 and (table == np.round(table)).all():
-        fractions = table[:, 1::2]
-        if not looks_like_colors(table[:, 3:6]) or (fractions <= 9).all() or re.search(r",0\d", text):
-            raise InputError(
-                "its commas can be read in two ways (between fields or before decimals): "
-                f"write numbers with decimal points, or {_NAME_THEM}"
-            )
-
-
-def _is_grid(table: Numbers) -> bool:
-    """Whether the first two columns run like rows and columns of a scanner's grid, as FARO exports them."""
-    indices, rest = table[:, :2], table[:, 2:5]
-    if not ((indices >= 0) & (indices == np.round(indices)) & (indices < 1e5)).all() or (rest == np.round(rest)).all():
-        return False
-    if table.shape[1] >= 6 and looks_like_normals(table[:, 3:6]):
-        return False
-    steps = np.diff(indices, axis=0)
-    return any(((slow > 0) | ((slow == 0) & (fast > 0))).all() for slow, fast in (steps.T, steps.T[::-1]))
+    return all(word.isdecimal() for word in fields) and counts(np.array(fields, np.float64))
 
 
 def _with_intensity(cloud: PointCloud) -> PointCloud:

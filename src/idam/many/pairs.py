@@ -13,6 +13,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from idam import rigid
 from idam.errors import InputError
 from idam.io.files import StrPath, one_line
@@ -55,7 +57,8 @@ class Kept:
         for line in text.split("\n")[:-1]:  # what follows the last line's end was cut short
             try:
                 row = json.loads(line)
-                self.rows[row["key"]] = row
+                if _is_whole(row):
+                    self.rows[row["key"]] = row
             except (ValueError, TypeError, KeyError):
                 continue
         if text and not text.endswith("\n"):
@@ -112,6 +115,15 @@ def register_pairs(
         ready += 1
         progress("pairs registered", ready, len(pairs))
     return {pair: kept.rows[keys[pair]] for pair in pairs}
+
+
+def _is_whole(row: Row) -> bool:
+    """Whether a row says what a merge needs to know: a pair whose line was damaged is registered anew."""
+    if row["error"]:
+        return isinstance(row["error"], str)
+    shapes = {"transformation": (4, 4), "information": (6, 6), "confidence": (), "reach": ()}
+    numbers = {name: np.array(row[name], np.float64) for name in shapes}
+    return all(numbers[name].shape == shape and np.isfinite(numbers[name]).all() for name, shape in shapes.items())
 
 
 def key_of(source: Scan, target: Scan, options: dict[str, Any]) -> str:
