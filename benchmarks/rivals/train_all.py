@@ -2,9 +2,9 @@
 
     python -m benchmarks.rivals.train_all FOLDER --data DIR
 
-Sized to 18 minutes of an H200: 15 for DCP and PRNet together, 1 for each PointNetLK. It has not run on one yet. What was
-stopped goes on, as each rival does from its ``last.ckpt``. Each leaves ``FOLDER/METHOD-EXPERIMENT.safetensors`` and, in
-a folder of the same name, the curves of its loss and its validation for TensorBoard.
+Sized to 18 minutes of an H200: 15 for DCP and PRNet together, 1 for each PointNetLK. It has not run on one yet. What
+was stopped goes on, as each rival does from its ``last.ckpt``. Each leaves ``FOLDER/METHOD-EXPERIMENT.safetensors``
+and, in a folder of the same name, the curves of its loss and its validation for TensorBoard.
 """
 
 from __future__ import annotations
