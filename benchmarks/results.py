@@ -50,11 +50,15 @@ compute it. Times are medians for one pair at a time on a machine that was also 
 are those under Efficiency, which were measured in turns on an idle machine. A row that ran on fewer pairs than the
 others, for time, says on how many.
 
-- `...-paper`: the network with the paper's inference: 3 iterations, N/6 points, no further tries.
+- `...-paper`: the network with the paper's inference: 3 iterations, N/6 points, no further tries. Models whose names
+  end in `-paper` were trained for it.
 - `...-tuned`: a method of others with settings chosen on validation pairs, beside its published settings.
 - `pointnetlk`, `dcp`, `prnet`: our implementations (`benchmarks/rivals`), trained for 12 minutes of one core for each
   table (753 to 928, 88 to 114 and 66 to 73 steps of 8 pairs; PRNet with noise 26 minutes, sharing its core). Their
-  authors trained for hours on a GPU. These rows show what little training gives, not what the methods can do.
+  authors trained for hours on a GPU. These rows show what little training gives, not what the methods can do. Their
+  weights are not in the package: `python -m benchmarks.rivals.train_all FOLDER --data modelnet40` trains all nine, and
+  `idam evaluate unseen-shapes --data modelnet40 --method benchmarks.rivals.methods:dcp --model
+  FOLDER/dcp-unseen-shapes.safetensors` measures one (in the commands below they still have short names).
 - `register`: the whole of `idam.register`, with the default model unless another is named. A fifth of that model's
   training data are halves of ModelNet40's training shapes, of all categories, so the unseen categories are not new to
   it. It assumes no limit on the rotation and may find another pose of a symmetric shape.

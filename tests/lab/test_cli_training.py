@@ -112,7 +112,7 @@ def test_train_passes_every_option_on(idam, trainable, tmp_path, monkeypatch):
     options = {"features": "fpfh", "epochs": 2.5, "batch-size": 8, "schedule": "one-cycle", "learning-rate": 0.002}
     options |= {"seed": 7, "device": "cpu", "precision": "bf16", "validate-every": 11, "data": trainable}
     words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
-    words = ["train", "gaussian-noise", "--resume", *words, "--output", str(tmp_path / "a folder")]
+    words = ["train", "gaussian-noise", "--resume", "--fuse", *words, "--output", str(tmp_path / "a folder")]
     outcome = idam(*words)
     assert outcome.code == 0
     assert "best" in outcome.out
@@ -127,6 +127,7 @@ def test_train_passes_every_option_on(idam, trainable, tmp_path, monkeypatch):
         "resume": True,
         "device": "cpu",
         "precision": "bf16",
+        "fuse": True,
         "validate_every": 11,
     }
 

@@ -27,6 +27,7 @@ from idam.lab.training import TRAININGS, Recipe, loop, task, train
 from idam.lab.training import checkpoint as saving
 from idam.lab.training.batches import Batch, batch_at, split_validation
 from idam.lab.training.checkpoint import initial_model
+from idam.lab.training.pool import Pool
 from idam.lab.training.step import SupervisedStep
 from idam.lab.training.task import validate
 from idam.network.config import Config
@@ -217,9 +218,10 @@ def test_a_batch_depends_on_the_seed_and_the_step_alone(shapes):
     torch.rand(7)
     batch_at(shapes, SMALL, 2, 0, 1)
     again = batch_at(shapes, changed(epochs=7, learning_rate=1.0, schedule="step"), 5, 0, 1)
-    assert all(torch.equal(a, b) for a, b in zip(one, again, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(one[:6], again[:6], strict=True))
+    assert one.features is again.features is None
     for other in (batch_at(shapes, SMALL, 6, 0, 1), batch_at(shapes, changed(seed=1), 5, 0, 1)):
-        assert not any(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+        assert not any(torch.equal(a, b) for a, b in zip(one[:6], other[:6], strict=True))
 
 
 def test_no_two_batches_use_the_same_transforms(shapes):
@@ -294,7 +296,7 @@ def rows(points: Tensor, cloud: Tensor) -> list[int]:
 
 def test_balanced_sampling_chooses_what_is_matched(batch, matched):
     found = matched(SupervisedStep(IDAM(SMALL.config), SMALL, "32"), batch)
-    for points, cloud, index in zip(found, batch[:2], batch[4:], strict=True):
+    for points, cloud, index in zip(found, batch[:2], batch[4:6], strict=True):
         for b in range(4):
             assert rows(points[b], cloud[b]) == index[b].tolist()
 
@@ -317,7 +319,35 @@ def test_with_eliminate_hard_elimination_chooses_the_targets_and_half_of_the_sou
             assert sum(row in origin for row in kind.tolist()) >= 8
 
 
+def test_a_pool_s_batches_come_with_the_features_that_the_network_gives_them(shapes, monkeypatch):
+    monkeypatch.setattr(protocol, "CROPPED_POINTS", 96)
+    recipe, model = changed(pool=12), IDAM(SMALL.config)
+    pool = Pool(shapes, recipe, model)
+    batches = [pool.batch(step, 0, 1) for step in range(6)]
+    sources = {tuple(cloud[0].tolist()) for batch in batches[:3] for cloud in batch.source}
+    assert len(sources) == 12
+    assert {tuple(cloud[0].tolist()) for batch in batches[3:] for cloud in batch.source} == sources
+    assert not torch.equal(batches[0].source_index, pool.batch(3, 0, 1).source_index)
+    expected = model.eval().encode(batches[4].source, batches[4].target)
+    torch.testing.assert_close(batches[4].features, expected)
+    halves = [pool.batch(4, rank, 2) for rank in (0, 1)]
+    assert sorted(cloud[0].tolist() for half in halves for cloud in half.source) == sorted(
+        cloud[0].tolist() for cloud in batches[4].source
+    )
+
+
 # training
+
+
+def test_a_pool_trains_all_but_the_features(fit, tmp_path):
+    recipe = changed(pool=12, epochs=2)
+    with pytest.raises(KeyboardInterrupt):
+        fit(recipe, tmp_path, validate_every=2, stop_after=4)
+    assert len(fit(recipe, tmp_path, resume=True)) == 2
+    torch.manual_seed(recipe.seed)
+    trained, started = checkpoint(tmp_path)["model"], initial_model(recipe).state_dict()
+    kept = {name for name in trained if torch.equal(trained[name], started[name])}
+    assert kept == {name for name in trained if name.startswith("features.")}
 
 
 def test_the_loss_falls_and_more_points_are_matched_right(fit, tmp_path):
@@ -635,6 +665,7 @@ BAD_RECIPES = {
     "a negative radius": ({"radius": -0.05}, "radius"),
     "a share of points above one": ({"keep": 1.5}, "share"),
     "no points": ({"keep": 0.0}, "share"),
+    "a pool smaller than a batch": ({"pool": 3}, "pool of 3 pairs"),
     "negative noise": ({"noise": -0.01}, "sigma"),
     "noise that is no number": ({"noise": math.nan}, "sigma"),
     "a huge seed": ({"seed": 10**13}, "seed"),

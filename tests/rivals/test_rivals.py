@@ -379,7 +379,7 @@ def test_a_training_leaves_weights_that_tell_how_they_came_about(name, fit):
     told = provenance(output / "best.safetensors")
     assert told["experiment"] == "unseen-shapes"
     assert told["recipe"] == {
-        "method": name, "experiment": "unseen-shapes", "batch_size": 4, "precision": "32", "seed": 3
+        "method": name, "experiment": "unseen-shapes", "batch_size": 4, "precision": "32", "thin": False, "seed": 3
     }  # fmt: skip
     assert told["steps"] == 3
     assert told["command"].startswith(f"python -m benchmarks.rivals.train {name} unseen-shapes --data")
@@ -415,8 +415,42 @@ def test_minutes_count_over_resumptions_and_rates_fall_with_them(fit, trainer, m
     assert state["optimizer"]["param_groups"][0]["lr"] < 1e-3
     fit("dcp", "--minutes", 0.01, "--resume")
     assert torch.load(output / "last.ckpt")["progress"] == state["progress"]
-    rates = [trainer.rate(SMALL["dcp"](), share) for share in (0, 0.29, 0.31, 0.61, 0.81)]
-    assert [high / low for high, low in pairwise(rates)] == pytest.approx([1, 10, 10, 10])
+    rates = [trainer.rate(SMALL["dcp"](), share) for share in (0, 0.02, 0.29, 0.31, 0.61, 0.81)]
+    assert [high / low for high, low in pairwise(rates)] == pytest.approx([0.1, 1, 10, 10, 10])
+
+
+def test_a_training_may_begin_with_a_third_of_the_points(fit, trainer, monkeypatch):
+    seen, loss = [], DCP.loss
+    monkeypatch.setattr(DCP, "loss", lambda self, pairs: (seen.append(pairs.source.shape[1]), loss(self, pairs))[1])
+    fit("dcp", "--epochs", 2, "--thin")
+    assert seen == [24] * 3 + [72] * 7
+
+
+def test_thinned_pairs_are_some_of_their_points(trainer, pairs, generator):
+    some = trainer.thinned(pairs, generator)
+    assert some.source.shape == (16, 24, 3)
+    for one, whole in zip(some.source, pairs.source, strict=True):
+        assert len({tuple(point) for point in one.tolist()} & {tuple(point) for point in whole.tolist()}) == 24
+    assert torch.equal(some.rotation, pairs.rotation)
+
+
+def test_all_nine_are_trained_in_one_go_and_go_on(data, tmp_path, monkeypatch, trainer, capsys):
+    script = importlib.import_module("benchmarks.rivals.train_all")
+    for module in (trainer, script):
+        monkeypatch.setattr(module, "RIVALS", SMALL)
+    monkeypatch.setattr(trainer, "keep_freed_memory", lambda: True)  # it would hold for all tests after this one
+    monkeypatch.setattr(protocol, "CROPPED_POINTS", 72)
+    clock = count(0.0, 0.1)
+    monkeypatch.setattr(trainer, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    words = [tmp_path / "all", "--data", data, "--times", 0.003, "--batch-size", 4, "--device", "cpu"]
+    script.main(list(map(str, words)))
+    files = sorted((tmp_path / "all").glob("*.safetensors"))
+    assert len(files) == 9
+    told = {path.stem: provenance(path) for path in files}
+    assert all(name == f"{one['recipe']['method']}-{one['experiment']}" for name, one in told.items())
+    assert told["prnet-gaussian-noise"]["steps"] > told["pointnetlk-gaussian-noise"]["steps"]
+    script.main(list(map(str, words)))  # goes on, and finds nothing left to do
+    assert {path.stem: provenance(path) for path in files} == told
 
 
 def test_what_cannot_be_trained_is_refused(fit, capsys):

@@ -33,6 +33,10 @@ def train(
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="Last stage: train on the points that hard elimination keeps.")
     ] = False,
+    pool: Annotated[
+        int | None,
+        typer.Option(help="Draw so many pairs once and keep their features, which are then not trained."),
+    ] = None,
     radius: Annotated[float, typer.Option(help="Distance within which points match.")] = 0.05,
     keep: Annotated[float, typer.Option(help="Share of points that balanced sampling draws.")] = 1 / 6,
     noise: Annotated[
@@ -45,6 +49,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed of weights, pairs and samples.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     precision: Annotated[str, typer.Option(help="32 or bf16.")] = "32",
+    fuse: Annotated[bool, typer.Option("--fuse", help="Fuse the convolutions; needs a C++ compiler.")] = False,
     validate_every: Annotated[int, typer.Option(help="Steps between checkpoints.")] = 250,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint.")] = False,
 ) -> None:
@@ -82,6 +87,7 @@ def train(
         start=start,
         pairs=None if pairs is None else str(pairs),
         eliminate=eliminate,
+        pool=pool,
         radius=radius,
         keep=keep,
         noise=noise,
@@ -94,6 +100,7 @@ def train(
         resume=resume,
         device=device,
         precision=precision,
+        fuse=fuse,
         validate_every=validate_every,
         command=shlex.join(["idam", *sys.argv[1:]]),
     )

@@ -138,10 +138,16 @@ def test_the_register_row_takes_no_other_settings():
 
 def test_only_the_network_s_rows_have_weights_of_their_own():
     assert network.weights_for("gnn-idam", "unseen-shapes") == "gnn-unseen-shapes"
-    assert network.weights_for("gnn-idam-paper", "gaussian-noise") == "gnn-gaussian-noise"
     assert network.weights_for("gnn-idam", "no such experiment") is None
     assert network.weights_for("icp", "unseen-shapes") is None
     assert network.weights_for("register", "unseen-shapes") is None
+
+
+def test_the_paper_s_rows_prefer_weights_trained_for_its_inference(monkeypatch):
+    monkeypatch.setattr(network, "list_models", lambda: ["gnn-a", "gnn-a-paper", "gnn-b"])
+    assert network.weights_for("gnn-idam-paper", "a") == "gnn-a-paper"
+    assert network.weights_for("gnn-idam-paper", "b") == "gnn-b"
+    assert network.weights_for("gnn-idam", "a") == "gnn-a"
 
 
 def test_icp_after_the_network_brings_copies_of_a_cloud_together(weights):

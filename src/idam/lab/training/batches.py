@@ -15,14 +15,17 @@ from idam.network.elimination import share_of
 from idam.network.geometry import apply_transform
 from idam.network.sampling import balanced_sample
 
-__all__ = ["Batch", "batch_at", "generator_at", "pairs_at", "split_validation"]
+__all__ = ["Batch", "batch_at", "draw_pairs", "generator_at", "pairs_at", "rows_at", "sampled", "split_validation"]
 
 VALIDATION_SHAPES = 200
 VALIDATION_SEED = 7
 
 
 class Batch(NamedTuple):
-    """Pairs (:class:`idam.lab.data.pairs.Pairs`) and the rows (B, M) of each cloud that balanced sampling drew."""
+    """Pairs (:class:`idam.lab.data.pairs.Pairs`) and the rows (B, M) of each cloud that balanced sampling drew.
+
+    With both clouds' features, (B, N, K) and (B, P, K), where these are known (:class:`idam.lab.training.pool.Pool`).
+    """
 
     source: Tensor
     target: Tensor
@@ -30,6 +33,7 @@ class Batch(NamedTuple):
     translation: Tensor
     source_index: Tensor
     target_index: Tensor
+    features: tuple[Tensor, Tensor] | None = None
 
 
 def split_validation(shapes: Shapes, recipe: Recipe) -> tuple[Shapes, Pairs]:
@@ -55,7 +59,11 @@ def draw_pairs(points: Tensor, recipe: Recipe, generator: torch.Generator) -> Pa
 def batch_at(shapes: Shapes, recipe: Recipe, step: int, rank: int, world: int) -> Batch:
     """The pairs and sampled points of one process at one step, a function of the seed and the step alone."""
     generator = generator_at(recipe, step, rank)
-    pairs = pairs_at(shapes, recipe, step, generator, rank, world)
+    return sampled(pairs_at(shapes, recipe, step, generator, rank, world), recipe, generator)
+
+
+def sampled(pairs: Pairs, recipe: Recipe, generator: torch.Generator) -> Batch:
+    """Pairs with the rows that balanced sampling draws of them."""
     aligned = apply_transform(pairs.source, pairs.rotation, pairs.translation)
     count = share_of(pairs.source.shape[1], recipe.keep)
     source_index, target_index = balanced_sample(aligned, pairs.target, count, recipe.radius, generator)
@@ -71,8 +79,12 @@ def pairs_at(
     shapes: Shapes, recipe: Recipe, step: int, generator: torch.Generator, rank: int = 0, world: int = 1
 ) -> Pairs:
     """The pairs of one process at one step, drawn from its generator."""
-    per_epoch = len(shapes) // recipe.batch_size
-    epoch, position = divmod(step, per_epoch)
-    order = torch.randperm(len(shapes), generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
-    rows = order[position * recipe.batch_size : (position + 1) * recipe.batch_size][rank::world]
+    rows = rows_at(len(shapes), recipe, step)[rank::world]
     return draw_pairs(shapes.points[rows], recipe, generator)
+
+
+def rows_at(size: int, recipe: Recipe, step: int) -> Tensor:
+    """Which of so many rows make up a step's batch: all in turn, in an order of its own in each epoch."""
+    epoch, position = divmod(step, size // recipe.batch_size)
+    order = torch.randperm(size, generator=torch.Generator().manual_seed(recipe.seed * 1009 + epoch))
+    return order[position * recipe.batch_size : (position + 1) * recipe.batch_size]

@@ -232,6 +232,8 @@ def check_general(recipe: Recipe, precision: str) -> None:
             "training for practice teaches no convolution and no validity: "
             "add --set convolution=false --set hybrid_elimination=false"
         )
+    if recipe.pool is not None:
+        raise InputError("training for practice trains features: leave --pool out")
     if precision != "32":
         raise InputError("training for practice is in single precision: leave --precision out")
 

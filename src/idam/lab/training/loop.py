@@ -13,6 +13,7 @@ from torch import nn
 from idam.errors import InputError, MissingDependencyError
 from idam.io import make_folder
 from idam.lab.training.checkpoint import Progress, history, restore, save_checkpoint
+from idam.lab.training.fuse import fuse_convolutions
 from idam.lab.training.general import GeneralTask, learns_features_alone
 from idam.lab.training.log import Log, Parts
 from idam.lab.training.memory import keep_freed_memory
@@ -32,6 +33,7 @@ def train(
     resume: bool = False,
     device: str = "auto",
     precision: str = "32",
+    fuse: bool = False,
     validate_every: int = 250,
     command: str = "",
 ) -> Path:
@@ -44,6 +46,7 @@ def train(
         resume: go on from ``last.ckpt`` where there is one.
         device: ``auto``, ``cpu`` or ``cuda``; under ``torchrun`` each process takes its own.
         precision: ``32``, or ``bf16`` for matrix products and activations in bfloat16.
+        fuse: let ``torch.compile`` fuse the similarity convolutions.
         validate_every: steps between validations and checkpoints.
         command: the command line, for the provenance.
 
@@ -72,6 +75,8 @@ def train(
     check_batch(recipe.batch_size, task.size, fabric.world_size)
     total = max(1, round(recipe.epochs * (task.size // recipe.batch_size)))
     module = task.module
+    if fuse:
+        fuse_convolutions(module.model)
     optimizer = torch.optim.Adam(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     flush_to_zero(optimizer)
     progress = restore(output / "last.ckpt", module.model, optimizer, asdict(recipe)) if resume else Progress()

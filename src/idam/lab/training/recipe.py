@@ -34,6 +34,8 @@ class Recipe:
         iterations: iterations of a training step; the configuration's are those after training.
         eliminate: let hard elimination choose the target points, and half of the source points, as it does after
             training; balanced sampling chooses the other half.
+        pool: number of pairs drawn once and kept with their features, which are then not trained: of FPFH, or of the
+            GNN as it starts. None draws every step's pairs anew.
         start: name or file of a model, or a ``last.ckpt``, whose weights to start from; None for random ones.
         pairs: file of one's own pairs (:func:`idam.lab.data.own_pairs.read_own_pairs`), half of what general training
             draws.
@@ -52,6 +54,7 @@ class Recipe:
     keep: float = 1 / 6
     iterations: int = 3
     eliminate: bool = False
+    pool: int | None = None
     start: str | None = None
     pairs: str | None = None
     seed: int = 0
@@ -92,5 +95,7 @@ def check(recipe: Recipe) -> None:
         raise InputError(f"cannot add noise of sigma {recipe.sigma:g}: choose 0 or more, in the shapes' units")
     if not 0 < recipe.keep <= 1:
         raise InputError(f"cannot sample a share of {recipe.keep:g} of the points: choose one in (0, 1]")
+    if recipe.pool is not None and recipe.pool < recipe.batch_size:
+        raise InputError(f"a pool of {recipe.pool} pairs does not fill a batch of {recipe.batch_size}: choose more")
     if abs(recipe.seed) >= 2**31:
         raise InputError(f"the seed {recipe.seed} is too large: choose one of 32 bits")

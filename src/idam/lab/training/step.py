@@ -28,7 +28,7 @@ class SupervisedStep(nn.Module):
         """The loss of the pairs on their sampled points."""
         # Fabric's own autocast would round the coordinates on the way in, and the labels need them exact as well
         with torch.autocast(batch.source.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-            source_features, target_features = self.model.encode(batch.source, batch.target)
+            source_features, target_features = batch.features or self.model.encode(batch.source, batch.target)
             source_significance = self.model.significance(source_features)
             target_significance = self.model.significance(target_features)
             source_index, target_index = batch.source_index, batch.target_index

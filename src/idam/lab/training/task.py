@@ -13,6 +13,7 @@ from idam.lab.data.pairs import Pairs
 from idam.lab.evaluation.metrics import Metrics, measure
 from idam.lab.training.batches import Batch, batch_at, split_validation
 from idam.lab.training.checkpoint import Origin, Scores, initial_model
+from idam.lab.training.pool import Pool
 from idam.lab.training.recipe import Recipe
 from idam.lab.training.step import SupervisedStep
 
@@ -46,11 +47,17 @@ class PairTask:
         self.recipe = recipe
         self.shapes, self.pairs = split_validation(experiment_shapes(recipe.experiment, data, "train"), recipe)
         self.module = SupervisedStep(initial_model(recipe), recipe, precision)
-        self.size = len(self.shapes)
+        self.pool = None
+        if recipe.pool is not None:
+            self.pool = Pool(self.shapes, recipe, self.module.model)
+            self.module.model.features.requires_grad_(False)
+        self.size = len(self.shapes if self.pool is None else self.pool)
         self.held = f"{len(self.pairs)} shapes held out of the training split"
 
     def batch(self, step: int, rank: int, world: int) -> Batch:
-        """See :func:`idam.lab.training.batches.batch_at`."""
+        """See :func:`idam.lab.training.batches.batch_at`, and :class:`idam.lab.training.pool.Pool`."""
+        if self.pool is not None:
+            return self.pool.batch(step, rank, world)
         return batch_at(self.shapes, self.recipe, step, rank, world)
 
     def validate(self) -> tuple[float, Metrics]:

@@ -100,12 +100,15 @@ def find_ablation_weights(method: str, model: str | None) -> str:
 
 
 def weights_for(method: str, experiment: str | None) -> str | None:
-    """The weights trained for an experiment, where the method is the network alone and there are any."""
-    if "-idam" in method:
-        name = f"{method.split('-')[0]}-{experiment}"
-    else:
+    """The weights trained for an experiment, where the method is the network alone and there are any.
+
+    For the paper's inference those trained for it come first: ours keeps more points, and tries again.
+    """
+    if "-idam" not in method:
         return None
-    return name if name in list_models() else None
+    name = f"{method.split('-')[0]}-{experiment}"
+    names = (f"{name}-paper", name) if method.endswith("-paper") else (name,)
+    return next((name for name in names if name in list_models()), None)
 
 
 def _alone(features: str, model: str, settings: Sequence[str]) -> Method:
