@@ -76,7 +76,8 @@ def polish(surfaces: Surfaces, start: Array, dense: Callable[[], tuple[Array, Ar
         return _settled(lambda at: Pairs.of_points(surfaces, at), start, surfaces.spacing)
     source, target = (Dense.of(cloud) for cloud in points)
     step = max(1, size // EACH, math.ceil(len(source.points) / MOST))
-    places = source.points[::step]
+    # a point that lies off the surface would hold both means back: they follow the place that they lie around
+    places = source.patches(source.points[::step], size)[0].centres
     patches, _, _ = source.patches(places, size)
     return _settled(lambda at: Pairs.of_patches(patches, places, target, at, size), start, surfaces.spacing)
 
