@@ -139,7 +139,7 @@ def judged(pair: Pair) -> dict[str, Any] | None:
         if order(clouds[1]) < order(clouds[0]):
             clouds, truth = clouds[::-1], rigid.inverse(truth)
         pyramid = Pyramid(*clouds)
-        method = "symmetric" if pyramid.fine.size <= 1024 else "gicp"
+        method = "symmetric" if pyramid.sparse else "gicp"
         found = search(pyramid, resolve("default").descriptor, None, Scope(np.eye(4)), method)
     except InputError:
         return None

@@ -19,6 +19,7 @@ EVIDENCE = Evidence(
     close=0.75,
     off=0.0625,
     border=1.0,
+    fixed=0.03125,
     lead=2.25,
 )
 """Every field is another number, and few binary digits."""

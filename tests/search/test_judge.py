@@ -21,6 +21,7 @@ CLEAR = Evidence(
     close=1.0,
     off=0.01,
     border=1.0,
+    fixed=0.2,
     lead=LEAD,
 )
 """A clean pair with much overlap."""
@@ -33,6 +34,7 @@ NOTHING = Evidence(
     close=0.0,
     off=1.0,
     border=0.2,
+    fixed=0.0,
     lead=0.0,
 )
 BETTER = {
@@ -44,6 +46,7 @@ BETTER = {
     "close": (0.0, 0.3, 0.6, 1.0),
     "off": (1.0, 0.5, 0.1, 0.0),
     "border": (0.05, 0.3, 0.6, 1.0),
+    "fixed": (0.0, 0.001, 0.005, 0.02, 0.3),
 }
 """Values of each feature, from what speaks against an answer to what speaks for it."""
 GIVEN = [CLEAR, NOTHING]
@@ -53,7 +56,7 @@ def any_evidence(count: int) -> list[Evidence]:
     random = np.random.default_rng(0)
     shares = random.uniform(0.001, 1, (count, 6)).tolist()
     return [
-        Evidence(6 * a - 2, b, max(b, c), d, e * b, f, 1 - a, c, lead)
+        Evidence(6 * a - 2, b, max(b, c), d, e * b, f, 1 - a, c, 0.1 * d, lead)
         for (a, b, c, d, e, f), lead in zip(shares, random.uniform(-LEAD, LEAD, count).tolist(), strict=True)
     ]
 

@@ -53,6 +53,7 @@ _EVIDENCE = {
     "close": "Share of what touches that touches at a finer resolution, too",
     "off": "Distance from the other surface, as a share of the reach",
     "border": "How cleanly each sparse cloud ends where the other goes on, 0 to 1",
+    "fixed": "How firmly the surfaces hold each other where they do so least, 0 for a slide, to 1",
     "lead": "How far it is ahead of the next best answer, in logits",
 }
 """What the fields of :class:`idam.search.judge.Evidence` are called on the page."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from idam.rigid import Array
 from idam.search.ranking import Answer
+from idam.search.slides import SLIPPABLE
 
 __all__ = ["CONVERGED", "FEATURES", "LEAD", "Evidence", "confidence", "evidence", "features", "weight"]
 
@@ -26,7 +27,7 @@ CONVERGED = 0.5
 LEAD = 4.0
 """Logits past which being further ahead says no more: of 4, 6 and 8 it gives the most sure answers, with as few wrong
 ones, and the least calibration error."""
-FEATURES = ("likelihood", "overlap", "contained", "support", "violation", "close", "off", "border")
+FEATURES = ("likelihood", "overlap", "contained", "support", "violation", "close", "off", "border", "fixed")
 """What is known of an answer (:class:`idam.search.ranking.Answer`)."""
 
 
@@ -43,6 +44,7 @@ class Evidence:
         violation: share of the points that lie where the other scan saw through, in [0, 1].
         close: share of what touches that touches at a finer resolution, too, in [0, 1].
         off: median distance from the other cloud's tangent planes, as a share of the reach within which clouds touch.
+        fixed: least share of a motion that goes along the normals of what touches, in [0, 1].
         border: 1 where sparse clouds end where the other begins, less where they are mixed, in [0, 1].
         lead: by how many logits the answer is ahead of the best other one.
     """
@@ -55,6 +57,7 @@ class Evidence:
     close: float
     off: float
     border: float
+    fixed: float
     lead: float
 
 
@@ -66,7 +69,7 @@ class _Fit(NamedTuple):
 
 
 def features(answer: Answer | Evidence) -> Array:
-    """What the first function is linear in, (8,): the first bit of likelihood or violation says more than the last."""
+    """What the first function is linear in, (9,): the first bit of likelihood or violation says more than the last."""
     return np.array(
         [
             math.sqrt(max(answer.likelihood, 0.0)),
@@ -77,6 +80,7 @@ def features(answer: Answer | Evidence) -> Array:
             answer.close,
             -math.log(answer.off + 0.01),
             math.log(answer.border),
+            math.log(min(answer.fixed, SLIPPABLE) + 0.001),
         ]
     )
 

@@ -14,6 +14,7 @@ from idam.clouds.surfaces import TOUCHING, Surfaces
 from idam.rigid import Array
 from idam.search.matching import Matching
 from idam.search.overlap import exactness, shares
+from idam.search.slides import slippage
 from idam.search.sparse.border import mixing
 
 __all__ = ["Answer", "distinct", "improve", "likeliest", "ranked", "same", "scored", "verified"]
@@ -56,6 +57,8 @@ class Answer:
         close: share of what touches that touches on the fine clouds, too, in [0, 1]
             (:func:`idam.search.overlap.exactness`); of answers that were refined on them.
         off: median distance from the tangent planes there, as a share of the reach.
+        fixed: share of a motion that goes along the normals of what touches, of the motion that it is least of, in
+            [0, 1] (:func:`idam.search.slides.slippage`): 0 for what slides freely.
     """
 
     transformation: Array
@@ -67,6 +70,7 @@ class Answer:
     violation: float = 0.0
     close: float = 0.0
     off: float = 1.0
+    fixed: float = 0.0
 
     @property
     def score(self) -> float:
@@ -106,7 +110,9 @@ def verified(answer: Answer, matching: Matching, fine: Surfaces, method: str) ->
     transformation = align(fine, answer.transformation, reaches(method)[1], method, STEPS)
     close, off = exactness(fine, transformation, TOUCHING * surfaces.spacing)
     violation = matching.clouds.free_space.violation(transformation)
-    return replace(answer, transformation=transformation, violation=violation, close=close, off=off)
+    share, _, _ = slippage(surfaces, transformation)
+    fixed = max(0.0, float(share[0])) if len(share) else 0.0
+    return replace(answer, transformation=transformation, violation=violation, close=close, off=off, fixed=fixed)
 
 
 def likeliest(transformations: Array, matching: Matching, most: int) -> Array:
