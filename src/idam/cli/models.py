@@ -21,7 +21,8 @@ def models() -> None:
         history = provenance(name)
         config = history["config"]
         print(f"{name}  (the default)" if name == DEFAULT else name)
-        print(f"  for {USES.get(name, 'the experiment of the paper')}")
+        inference = " with the paper's inference" if name.endswith("-paper") else ""
+        print(f"  for {USES.get(name, 'the experiment of the paper' + inference)}")
         print(
             f"  {config['features']} features, {history.get('experiment', '')}, {config['iterations']} iterations, "
             f"{history.get('steps', '')} steps, seed {history.get('recipe', {}).get('seed', '')}, "
