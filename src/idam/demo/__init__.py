@@ -8,6 +8,7 @@ from pathlib import Path
 from idam.io import make_folder, read_point_cloud, write_point_cloud, write_transform
 from idam.registration import register
 from idam.report.page import write_report
+from idam.report.record import Record
 from idam.result import RegistrationResult
 
 __all__ = ["run"]
@@ -23,9 +24,10 @@ def run(output: Path) -> tuple[RegistrationResult, dict[str, Path]]:
     folder = resources.files("idam.demo")
     with resources.as_file(folder / "source.ply") as source, resources.as_file(folder / "target.ply") as target:
         clouds = read_point_cloud(source), read_point_cloud(target)
+        record = Record.of(source, target, unit="m")
     result = register(*clouds)
     files = {"page": output / "demo.html", "aligned": output / "aligned.ply", "transform": output / "transform.txt"}
-    write_report(files["page"], *clouds, result, source_name="source.ply", target_name="target.ply")
+    write_report(files["page"], *clouds, result, source_name="source.ply", target_name="target.ply", record=record)
     write_point_cloud(files["aligned"], clouds[0].transformed(result.transformation))
     write_transform(files["transform"], result.transformation)
     return result, files
