@@ -130,7 +130,11 @@ def test_register_from_end_to_end(work: Path, result: RegistrationResult) -> Non
     np.testing.assert_allclose(matrix, result.transformation, atol=1e-6)
     np.testing.assert_array_equal(printed_matrix(run.out), matrix)
     np.testing.assert_array_equal(content["transformation"], matrix)
-    for word in (f"{content['fitness']:.3f}", f"confidence  {chance(content['confidence'])}", f"{content['inlier_rmse']:.4g}"):
+    for word in (
+        f"{content['fitness']:.3f}",
+        f"confidence  {chance(content['confidence'])}",
+        f"{content['inlier_rmse']:.4g}",
+    ):
         assert word in run.out
     source, aligned = read_point_cloud(work / "source.ply"), read_point_cloud(work / "aligned.ply")
     np.testing.assert_allclose(aligned.points, source.points @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
