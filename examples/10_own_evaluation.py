@@ -32,7 +32,7 @@ for _ in range(6):
     result = idam.register(source, target)
     turned = np.degrees(rigid.angle(truth[:3, :3].T @ result.rotation))
     moved = np.linalg.norm(result.apply(source.mean(axis=0)) - rigid.apply(truth, source.mean(axis=0)[None])[0])
-    good = turned < 5 and moved < 0.05 * size
+    good = bool(turned < 5 and moved < 0.05 * size)
     right += good
     accepted += result.converged
     wrong += result.converged and not good

@@ -1,6 +1,6 @@
 """Write ``docs/examples.md`` from the numbered examples: each file's docstring, and the code below it.
 
-python examples/make_page.py
+``python examples/make_page.py`` in a clone.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def section(path: Path) -> str:
     title, _, prose = docstring.partition("\n")
     code = "\n".join(text.splitlines()[first.end_lineno :]).strip()
     return f"""
-#{title}
+## {title.rstrip(".")}
 
 [{path.name}](../examples/{path.name})
 

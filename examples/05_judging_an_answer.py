@@ -1,4 +1,4 @@
-"""Is it right?
+"""Judging an answer.
 
 Decide by `converged` and `confidence`, not by fitness. [What each number means](numbers.md) has every figure, what is
 good and what to do where it is bad.
