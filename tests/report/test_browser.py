@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from idam.io import PointCloud
 from idam.result import Hypothesis
 from pages import NATIONAL_GRID, local_points, make_pair, opened, scene_of, write
 
@@ -15,18 +16,26 @@ DRAWN = """
 const seen = [ink()];
 element("matches-before").click();
 for (const share of [0, 20, 50, 100]) { set("blend", share); viewer.draw(); seen.push(ink()); }
+set("blend", 0);
+element("own").click();
+viewer.draw();
+seen.push(ink());
 return seen;"""
 
 
 @pytest.mark.parametrize("software", [False, True])
 def test_both_clouds_are_drawn_and_blend_into_each_other(tmp_path: Path, software: bool) -> None:
     path = tmp_path / "page.html"
-    seen = np.array(opened(path, write(path), DRAWN, software=software))  # (5, 2 views, orange and blue)
+    source_cloud, *pair = make_pair()
+    painted = PointCloud(source_cloud.points, np.tile(np.array([30, 30, 255], np.uint8), (400, 1)))
+    page = write(path, painted, *pair)
+    seen = np.array(opened(path, page, DRAWN, software=software))  # (6, 2 views, orange and blue)
     assert seen[0].min() > 200
-    source, faded, both, target = seen[1:, 1]
+    source, faded, both, target, own = seen[1:, 1]
     assert source[0] > 200 and source[1] == 0
     assert target[1] > 200 and target[0] == 0
     assert source[0] > faded[0] > both[0]  # the source shines through what covers it
+    assert own[0] == 0 and own[1] == source[0]  # the source in a blue of its own
 
 
 USED = """

@@ -60,4 +60,4 @@ async function start() {
   viewer = new Viewer({ ids: ["before", "after"], up: scene.up, clouds: scans, subject });
 }
 
-const ready = start();
+const ready = begun(start());

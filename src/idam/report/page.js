@@ -109,4 +109,4 @@ async function start() {
   viewer = new Viewer({ ids: ["before", "after"], up: scene.up, clouds, subject, theme: readColours });
 }
 
-const ready = start();
+const ready = begun(start());

@@ -36,6 +36,16 @@ async function unpacked(packed, name, colour) {
   };
 }
 
+/** Passes on the start of a page, and says so where it fails: a browser may be too old to unpack the points. */
+function begun(start) {
+  start.catch((error) => {
+    const textContent = `The points cannot be shown (${error.message}): a browser of 2023 or newer is needed.`;
+    Object.assign(element("warning"), { hidden: false, textContent });
+    console.error(error);
+  });
+  return start;
+}
+
 // Matrices: 4x4, column-major, as WebGL wants them
 
 function multiply(a, b) {
