@@ -16,7 +16,8 @@ from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.table import order, short_name
 from idam.lab.figures.plot_curves import draw_timings
 from idam.lab.figures.timings import read_timings
-from idam.report.style import BLUE, ORANGE, VERMILLION, look, save
+from idam.report.palette import BLUE, ORANGE, VERMILLION
+from idam.report.style import look, save
 
 ERRORS = {
     "unseen-shapes": "unseen shapes",

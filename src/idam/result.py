@@ -188,7 +188,7 @@ class RegistrationResult:
 
 
 def chance(probability: float) -> str:
-    """Write a probability in whole per cent, never rounded to certainty."""
+    """Write a probability in whole per cent, rounded down, and never as certainty: ``> 99 %``, ``< 1 %``."""
     if probability > 0.99:
         return "> 99 %"
-    return "< 1 %" if probability < 0.01 else f"{100 * probability:.0f} %"
+    return "< 1 %" if probability < 0.01 else f"{int(100 * probability + 1e-9)} %"

@@ -21,6 +21,7 @@ import idam
 from idam import RegistrationResult, cli, registration
 from idam.io import PointCloud, format_transform, read_point_cloud, read_transform, write_point_cloud
 from idam.report import view
+from idam.result import chance
 from idam.weights import provenance
 from motions import degrees, rotation
 
@@ -129,7 +130,11 @@ def test_register_from_end_to_end(work: Path, result: RegistrationResult) -> Non
     np.testing.assert_allclose(matrix, result.transformation, atol=1e-6)
     np.testing.assert_array_equal(printed_matrix(run.out), matrix)
     np.testing.assert_array_equal(content["transformation"], matrix)
-    for word in (f"{content['fitness']:.3f}", f"{content['confidence']:.2f}", f"{content['inlier_rmse']:.4g}"):
+    for word in (
+        f"{content['fitness']:.3f}",
+        f"confidence  {chance(content['confidence'])}",
+        f"{content['inlier_rmse']:.4g}",
+    ):
         assert word in run.out
     source, aligned = read_point_cloud(work / "source.ply"), read_point_cloud(work / "aligned.ply")
     np.testing.assert_allclose(aligned.points, source.points @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
@@ -137,7 +142,9 @@ def test_register_from_end_to_end(work: Path, result: RegistrationResult) -> Non
     np.testing.assert_array_equal(aligned.colors, source.colors)
     page = (work / "look.html").read_text().lower()
     assert page.startswith("<!doctype html>")
-    assert "source.ply" in page
+    size = (work / "source.ply").stat().st_size
+    assert f"source.ply, {size:,} bytes, " in page  # for a report to hand in
+    assert "<th>options</th><td>model default, max-angle 180.0, refine gicp, seed 0</td>" in page
     assert "target.xyz" in page
 
 

@@ -32,8 +32,9 @@ from matplotlib.text import Text  # noqa: E402
 
 from idam.lab.figures.plot_curves import draw_calibration, draw_iterations, draw_timings  # noqa: E402
 from idam.lab.figures.plot_scenes import draw_key_points, draw_matches, draw_overlays  # noqa: E402
+from idam.report.palette import GREEN, VERMILLION  # noqa: E402
 from idam.report.panels import project  # noqa: E402
-from idam.report.style import GREEN, VERMILLION, look, save  # noqa: E402
+from idam.report.style import look, save  # noqa: E402
 
 
 @pytest.fixture

@@ -99,12 +99,14 @@ def cores() -> int:
 
 def show(result: MergeResult, output: Path) -> None:
     """Print what is placed, what is not and why, and where the files are."""
+    from idam.result import chance
+
     width = max(map(len, result.names))
     print(f"{'scan':<{width}}  component  confidence")
     for scan, name in enumerate(result.names):
         component = result.component_of(scan)
         where = "-" if result.poses[scan] is None else str(component)
-        sure = "-" if result.poses[scan] is None else f"{int(1000 * result.confidence[scan]) / 1000:.3f}"
+        sure = "-" if result.poses[scan] is None else chance(result.confidence[scan])
         print(f"{name:<{width}}  {where:>9}  {sure:>10}  {result.reason[scan]}".rstrip())
     used = sum(link.used for link in result.links)
     placed = sum(result.poses[scan] is not None for scan in result.components[0])

@@ -43,6 +43,7 @@ def register(
     refine: Annotated[str, typer.Option(help="Fine alignment: gicp, plane, point, symmetric or none.")] = "gicp",
     seed: Annotated[int, typer.Option(help="Has no effect: nothing is drawn at random.")] = 0,
     device: Annotated[str, typer.Option(help="Where a network of the paper runs, such as cuda.")] = "cpu",
+    unit: Annotated[str, typer.Option(help="Unit of the coordinates, such as m, for the page to name.")] = "",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the 4x4 alone, for scripts.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Report each step and its time on stderr.")] = False,
 ) -> None:
@@ -103,8 +104,13 @@ def register(
         write_json(json, result.to_dict())
     if html is not None:
         from idam.report.page import write_report
+        from idam.report.record import Record
 
-        write_report(html, source_cloud, target_cloud, result, source_name=source.name, target_name=target.name)
+        options = {"model": model, "init": init, "max-angle": max_angle, "voxel-size": voxel_size, "refine": refine}
+        options |= {"max-correspondence-distance": max_correspondence_distance, "seed": seed}
+        record = Record.of(source, target, unit=unit, options=options)
+        names = {"source_name": source.name, "target_name": target.name}
+        write_report(html, source_cloud, target_cloud, result, **names, record=record)
     if save_plot is not None:
         from idam.report.plot import write_plot
 

@@ -20,15 +20,24 @@ Data = Annotated[Path, typer.Option("--data", help="Folder of ModelNet40 (modeln
 
 
 def show(result: RegistrationResult, quiet: bool = False) -> None:
-    """Print a result: the 4x4 as CloudCompare takes it, then, unless quiet, the figures and why."""
+    """Print a result: the 4x4 as CloudCompare takes it, then, unless quiet, the motion, the figures and why.
+
+    The 4x4 does not fit a cloud that CloudCompare shifted when it opened it (its "global shift"): there the moved file
+    is what to open.
+    """
     from idam.io import format_transform
+    from idam.report.motion import motion_of
+    from idam.result import chance
 
     print(format_transform(result.transformation))
     if quiet:
         return
+    print("the same about the source's centroid: turn, then shift")
+    for name, value in motion_of(result.transformation, result.clouds[0]).written():
+        print(f"  {name:<10}{value}")
     print(f"fitness     {result.fitness:.3f}  (within {result.max_correspondence_distance:.4g})")
     print(f"inlier RMSE {result.inlier_rmse:.4g}")
-    print(f"confidence  {result.confidence:.2f}")
+    print(f"confidence  {chance(result.confidence)}")
     if result.reason:
         print(f"reason      {result.reason}")
     print(f"time        {result.seconds:.2f} s")

@@ -16,6 +16,7 @@ def view(
     transform: Annotated[
         Path | None, typer.Argument(help="File of the transform; if left out, the clouds as they are.")
     ] = None,
+    unit: Annotated[str, typer.Option(help="Unit of the coordinates, such as m, for the page to name.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Write the page here.")] = Path("view.html"),
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the page.")] = False,
 ) -> None:
@@ -31,11 +32,13 @@ def view(
 
     from idam.io import check_outputs, read_point_cloud, read_transform
     from idam.report.page import write_view
+    from idam.report.record import Record
 
     check_outputs([output], [path for path in (source, target, transform) if path is not None])
     matrix = np.eye(4) if transform is None else read_transform(transform)
     clouds = read_point_cloud(source), read_point_cloud(target)
-    write_view(output, *clouds, matrix, source_name=source.name, target_name=target.name)
+    record = Record.of(source, target, unit=unit, options={"transform": transform})
+    write_view(output, *clouds, matrix, source_name=source.name, target_name=target.name, record=record)
     print(f"look at {output}")
     if not no_open:
         typer.launch(str(output.resolve()))

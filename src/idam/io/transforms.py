@@ -46,6 +46,7 @@ def read_transform(path: StrPath) -> NDArray[np.float64]:
 def format_transform(T: ArrayLike, form: str = "matrix") -> str:
     """Write a transform as 4 lines of 4 numbers, ready to paste into CloudCompare's "Apply transformation".
 
+    It does not fit a cloud that CloudCompare shifted when it opened it (its "global shift"): move the file instead.
     Every number is in the shortest form that reads back the same. ``form`` may be one of
     :data:`idam.io.notations.FORMS` instead.
     """

@@ -7,6 +7,7 @@ import html
 import numpy as np
 
 from idam.many.result import MergeResult
+from idam.result import chance
 from idam.rigid import Array
 
 __all__ = ["draw_graph", "layout"]
@@ -25,10 +26,10 @@ def draw_graph(result: MergeResult, colors: list[str]) -> str:
     for link in sorted(result.links, key=lambda link: (link.used, link.confidence)):
         (x1, y1), (x2, y2) = places[link.source], places[link.target]
         style = "used" if link.used else "rejected"
-        names = html.escape(f"{result.names[link.source]} to {result.names[link.target]}")
+        title = f"{result.names[link.source]} to {result.names[link.target]}: confidence {chance(link.confidence)}"
         lines.append(
             f'<line class="{style}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" '
-            f'style="--sure: {link.confidence:.3f}"><title>{names}: confidence {link.confidence:.3f}</title></line>'
+            f'style="--sure: {link.confidence:.3f}"><title>{html.escape(title)}</title></line>'
         )
     for scan, (x, y) in enumerate(places):
         name = html.escape(result.names[scan].encode("utf-8", "replace").decode("utf-8"))

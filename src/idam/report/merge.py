@@ -1,62 +1,63 @@
 """Many scans put together as a page to look at: a self-contained HTML file that opens offline in any browser.
 
-Python fills in the figures, draws the graph and packs the points; ``merge.html`` beside this file draws them.
+Python fills in the figures, draws the graph and packs the points; ``merge.html`` beside this file shows them, with
+``viewer.js``, which it shares with the page of a pair.
 """
 
 from __future__ import annotations
 
-import base64
 import colorsys
-import html
-import json
 import math
-import re
-from importlib import resources
 from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from idam import rigid
-from idam.io import write_text
+from idam.io import PointCloud, write_text
 from idam.many.result import Link, MergeResult
 from idam.report.graph import draw_graph
-from idam.report.view import frame, guess_up, sample
+from idam.report.markup import escape, fill, number, plain_json, template
+from idam.report.pack import packed, thinned
+from idam.report.record import Record
+from idam.report.view import frame, guess_up
+from idam.result import chance
 from idam.rigid import Array
 
 __all__ = ["write_merge_report"]
 
 MOST_POINTS = 400_000
-"""Points of all scans together that a page shows: 2.4 MB, and 60 scans still turn smoothly without a graphics card."""
+"""Points of all scans together that a page shows: 60 scans still turn smoothly without a graphics card."""
 MOST_OF_ONE = 25_000
 """Points of one scan that a page shows at most."""
 FAR_APART = 6.0
 """Radii of the model beyond which scans as given are too far apart to be drawn in one picture."""
-STEPS = 65535
-"""Coordinates are sent as 16-bit integers: steps along the longest side of a scan's bounding box."""
 
 
-def write_merge_report(path: str | PathLike[str], result: MergeResult) -> None:
+def write_merge_report(path: str | PathLike[str], result: MergeResult, *, record: Record | None = None) -> None:
     """Write the page of a merge: all scans before and after, the graph of links, and which scans have no sure place.
 
-    The page refers to nothing outside itself. The same result gives the same bytes, but for the time it took.
+    The page refers to nothing outside itself. The same result and date give the same bytes, but for the time it took.
 
     Raises:
         InputError: the file cannot be written.
     """
+    record = record or Record()
     colors = palette(len(result.names))
     placed = [scan for scan in result.components[0] if result.poses[scan] is not None]
     used = [link for link in result.links if link.used]
     level, verdict = verdict_of(result)
     page = fill(
-        resources.files("idam.report").joinpath("merge.html").read_text(encoding="utf-8"),
+        template("merge.html"),
+        made=escape(record.made),
+        unit=escape(record.lengths),
         title=escape(f"{len(placed)} of {len(result.names)} scans placed"),
         level=level,
         verdict=escape(verdict),
         placed=f"{len(placed)} of {len(result.names)}",
         components=str(sum(result.poses[scans[0]] is not None for scans in result.components)),
         links=f"{len(used)} of {len(result.links)}",
-        least=least_confidence(result),
+        least=escape(least_confidence(result)),
         seconds=number(result.seconds, 3),
         scans="\n".join(scan_row(result, scan, colors[scan]) for scan in range(len(result.names))),
         table="\n".join(link_row(result, link) for link in sorted(result.links, key=lambda link: -link.confidence)),
@@ -82,7 +83,7 @@ def least_confidence(result: MergeResult) -> str:
     """The least confidence of a scan of the largest component."""
     scans = result.components[0]
     least = min((result.confidence[scan] for scan in scans if result.poses[scan] is not None), default=0.0)
-    return "> 99.9 %" if least > 0.999 else f"{math.floor(1000 * least) / 10:.1f} %"
+    return chance(least)
 
 
 # The tables
@@ -95,7 +96,7 @@ def scan_row(result: MergeResult, scan: int, color: str) -> str:
     switch = f'<input type="checkbox" class="show" data-scan="{scan}" {"checked" if shown else "disabled"}>'
     name = f'<label>{switch}<span class="swatch" style="--swatch: {color}"></span>{escape(result.names[scan])}</label>'
     component = "" if pose is None else str(result.component_of(scan))
-    sure = "not placed" if pose is None else f"{math.floor(1000 * result.confidence[scan]) / 10:.1f} %"
+    sure = "not placed" if pose is None else escape(chance(result.confidence[scan]))
     style = ' class="doubtful"' if result.reason[scan] else ""
     return f"<tr{style}><td>{name}</td><td>{component}</td><td>{sure}</td><td>{escape(result.reason[scan])}</td></tr>"
 
@@ -108,7 +109,7 @@ def link_row(result: MergeResult, link: Link) -> str:
         (escape(result.names[link.source]), ""),
         (escape(result.names[link.target]), ""),
         ("used" if link.used else "rejected", ""),
-        (f"{math.floor(1000 * link.confidence) / 10:.1f} %", str(link.confidence)),
+        (escape(chance(link.confidence)), str(link.confidence)),
         (f"{100 * link.overlap:.0f} %", str(link.overlap)),
         (number(link.residual, 3), str(link.residual)),
         (f"{number(degrees, 2)}°, {number(shift, 2)}" if link.loop_error else "no loop", sortable(degrees)),
@@ -146,38 +147,44 @@ def sortable(value: float) -> str:
 
 
 def scene(result: MergeResult, colors: list[str]) -> dict[str, Any]:
-    """What the page's script draws: each scan about its own centre, with its poses before and after."""
+    """What the page's script draws: each scan about its own centre, with its poses before and after.
+
+    ``before`` is where a scan is drawn, ``given`` where it lay as it was given: they differ only where scans too far
+    apart are drawn side by side.
+    """
     each = min(MOST_OF_ONE, MOST_POINTS // max(1, len(result.names)))
-    clouds = [None if cloud is None else sample(cloud.points, each) for cloud in result.clouds]
-    centres = [None if points is None else (points.min(0) + points.max(0)) / 2 for points in clouds]
+    clouds = [None if cloud is None else thinned(cloud, each) for cloud in result.clouds]
+    centres = [None if cloud is None else (cloud.points.min(0) + cloud.points.max(0)) / 2 for cloud in clouds]
     after = [placed(result, scan, centres[scan]) for scan in range(len(clouds))]
     views = []
-    for number, scans in enumerate(result.components):
+    for component, scans in enumerate(result.components):
         if result.poses[scans[0]] is not None:
             inside = [
                 rigid.apply(pose, local(clouds[scan], centres[scan]))
                 for scan in scans
                 if (pose := after[scan]) is not None
             ]
-            views.append({"component": number, **frame(np.concatenate(inside))})
-    before, apart = as_given(clouds, centres, max([view["radius"] for view in views], default=0.0))
+            views.append({"component": component, **frame(np.concatenate(inside))})
+    before, given, apart = as_given(clouds, centres, max([view["radius"] for view in views], default=0.0))
     whole = [
-        rigid.apply(pose, local(points, centre))
-        for points, centre, pose in zip(clouds, centres, before, strict=True)
-        if points is not None
+        rigid.apply(pose, local(cloud, centre))
+        for cloud, centre, pose in zip(clouds, centres, before, strict=True)
+        if cloud is not None
     ]
     return {
         "scans": [
             None
-            if points is None
+            if cloud is None
             else {
-                "points": packed(points),
+                "name": result.names[scan].encode("utf-8", "replace").decode("utf-8"),
+                "cloud": packed(cloud),
                 "color": color,
                 "component": result.component_of(scan) if result.poses[scan] is not None else -1,
                 "before": rows(before[scan]),
+                "given": rows(given[scan]),
                 "after": rows(after[scan]),
             }
-            for scan, (points, color) in enumerate(zip(clouds, colors, strict=True))
+            for scan, (cloud, color) in enumerate(zip(clouds, colors, strict=True))
         ],
         "views": views,
         "before": frame(np.concatenate(whole)),
@@ -186,11 +193,11 @@ def scene(result: MergeResult, colors: list[str]) -> dict[str, Any]:
     }
 
 
-def local(points: Array | None, centre: Array | None) -> Array:
+def local(cloud: PointCloud | None, centre: Array | None) -> Array:
     """Points about a scan's centre."""
-    assert points is not None
+    assert cloud is not None
     assert centre is not None
-    return np.asarray(points - centre)
+    return np.asarray(cloud.points - centre)
 
 
 def placed(result: MergeResult, scan: int, centre: Array | None) -> Array | None:
@@ -204,33 +211,29 @@ def placed(result: MergeResult, scan: int, centre: Array | None) -> Array | None
     return rigid.transform(pose[:3, :3], moved)
 
 
-def as_given(clouds: list[Array | None], centres: list[Array | None], radius: float) -> tuple[list[Array], bool]:
-    """Where the scans' points about their centres lie as given; side by side where that is too far apart to see."""
+def as_given(
+    clouds: list[PointCloud | None], centres: list[Array | None], radius: float
+) -> tuple[list[Array], list[Array], bool]:
+    """Where the scans' points about their centres are drawn and where they lie, as given.
+
+    They are drawn side by side where they lie too far apart to be seen.
+    """
     some = np.stack([centre for centre in centres if centre is not None])
     middle = some.mean(0)
     largest = max(
-        float(np.abs(local(points, centre)).max())
-        for points, centre in zip(clouds, centres, strict=True)
-        if points is not None
+        float(np.abs(local(cloud, centre)).max())
+        for cloud, centre in zip(clouds, centres, strict=True)
+        if cloud is not None
     )
     apart = float(np.linalg.norm(some - middle, axis=1).max()) > FAR_APART * max(radius, largest)
     side = math.ceil(math.sqrt(len(clouds)))
-    places = [
+    given = [np.zeros(3) if centre is None else centre - middle for centre in centres]
+    grid = [
         np.array([scan % side - (side - 1) / 2, (side - 1) / 2 - scan // side, 0.0]) * 2 * largest
-        if apart
-        else (middle if centre is None else centre) - middle
-        for scan, centre in enumerate(centres)
+        for scan in range(len(clouds))
     ]
-    return [rigid.transform(np.eye(3), place) for place in places], apart
-
-
-def packed(points: Array) -> dict[str, Any]:
-    """Points as 16-bit integers about their centre: coordinate = step (integer - 32767.5)."""
-    low, high = points.min(0), points.max(0)
-    step = float((high - low).max()) / STEPS or 1.0
-    quantised = np.rint((points - (low + high) / 2) / step + STEPS / 2).clip(0, STEPS)
-    data = base64.b64encode(np.ascontiguousarray(quantised, "<u2").tobytes()).decode("ascii")
-    return {"data": data, "step": step}
+    drawn, lying = ([rigid.transform(np.eye(3), place) for place in some] for some in (grid if apart else given, given))
+    return drawn, lying, apart
 
 
 def rows(pose: Array | None) -> list[list[float]] | None:
@@ -248,31 +251,3 @@ def palette(count: int) -> list[str]:
         rgb = colorsys.hsv_to_rgb(hue, *shades[i % 3])
         colors.append("#" + "".join(f"{round(255 * value):02x}" for value in rgb))
     return colors
-
-
-# Text
-
-
-def number(value: float, digits: int) -> str:
-    """A number of any unit and size to that many significant digits."""
-    if not math.isfinite(value):
-        return "n/a"
-    magnitude = math.floor(math.log10(abs(value))) if value else 0
-    style = f",.{max(0, digits - 1 - magnitude)}f" if -5 <= magnitude <= 9 else f".{digits - 1}e"
-    return format(value, style).replace("-", "−")
-
-
-def plain_json(value: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def escape(text: str) -> str:
-    """Any text, even a file name that is not Unicode, for use in HTML."""
-    return html.escape(text.encode("utf-8", "replace").decode("utf-8"))
-
-
-def fill(template: str, **fields: str) -> str:
-    """Put each field in place of its ``{{name}}``, in one pass: what is put in is not searched again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: fields[match[1]], template)

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from idam.io import PointCloud
 from idam.io.files import silenced
+from idam.report.palette import SOURCE, TARGET
 from idam.report.panels import Array, dot, draw_clouds, empty_grid, legend, project, same_scale
-from idam.report.style import BLUE, ORANGE, look, save_as
-from idam.report.view import approach, chance, frame, guess_up, sample
-from idam.result import Matches, RegistrationResult
+from idam.report.style import look, save_as
+from idam.report.view import approach, frame, guess_up, sample
+from idam.result import Matches, RegistrationResult, chance
 
 __all__ = ["draw_result", "write_plot"]
 
@@ -64,7 +65,7 @@ def write_plot(
 
 def draw_result(source: Array, target: Array, result: RegistrationResult, title: str) -> Figure:
     """The clouds before, the strongest matches between them drawn apart, and the clouds after, side by side."""
-    source, target = _core(sample(source, POINTS)), _core(sample(target, POINTS))
+    source, target = (_core(points[sample(points, POINTS)]) for points in (source, target))
     middle, origin = ((cloud.min(axis=0) + cloud.max(axis=0)) / 2 for cloud in (source, target))
     offset, gap = approach([source - middle, target - origin], middle - origin)
     up = guess_up(target)
@@ -84,7 +85,7 @@ def draw_result(source: Array, target: Array, result: RegistrationResult, title:
         axes.set_title(caption)
         same_scale([axes])
     figure.suptitle(title, fontsize=9, parse_math=False)
-    legend(figure, [dot(ORANGE, "source"), dot(BLUE, "target")])
+    legend(figure, [dot(SOURCE, "source"), dot(TARGET, "target")])
     return figure
 
 
@@ -129,7 +130,7 @@ def _aside(source: Array, target: Array) -> Array:
 def _draw_pair(axes: Axes, source: Array, target: Array, palest: float = PALEST) -> None:
     """Both clouds in their colours; pixels even in an SVG, where each point would be an element."""
     size = float(np.clip(12_000 / (len(source) + len(target)), 0.3, 4.0))
-    draw_clouds(axes, (source, ORANGE), (target, BLUE), size=size, palest=palest).set_rasterized(True)
+    draw_clouds(axes, (source, SOURCE), (target, TARGET), size=size, palest=palest).set_rasterized(True)
 
 
 def _draw_matches(axes: Axes, start: Array, end: Array, matches: Matches) -> None:

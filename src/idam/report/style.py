@@ -14,16 +14,12 @@ from matplotlib.figure import Figure
 
 from idam.io.files import write_bytes
 
-__all__ = ["BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "VERMILLION", "look", "save", "save_as"]
+__all__ = ["COLUMN", "PAGE", "look", "save", "save_as"]
 
 PAGE = 4.8
 """Width of the paper's text in inches: printed as they are, the figures fit, and 8 point is 8 point."""
 COLUMN = 3.4
 """Width of half a page in two columns."""
-
-# Okabe and Ito's, which colour-blind people can tell apart
-BLUE, ORANGE, GREEN, VERMILLION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
-PALETTE = (BLUE, ORANGE, GREEN, VERMILLION, "#CC79A7", "#56B4E9", "#000000")
 
 _SETTINGS: dict[Any, Any] = {
     "font.size": 8,

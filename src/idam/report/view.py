@@ -1,4 +1,4 @@
-"""How a pair of clouds is looked at, on a page or in a plot: which points, how far apart, which way up."""
+"""How clouds are looked at, on a page or in a plot: which points, how far apart, which way up."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from idam.errors import MissingDependencyError
+from idam.rigid import Rows
 
-__all__ = ["approach", "chance", "check_matplotlib", "frame", "guess_up", "sample"]
+__all__ = ["approach", "check_matplotlib", "frame", "guess_up", "sample"]
 
 Points = NDArray[np.float64]
 
@@ -21,13 +22,13 @@ def check_matplotlib(what: str) -> None:
         raise MissingDependencyError(f"drawing {what} needs Matplotlib: pip install 'idam[figures]'")
 
 
-def sample(points: Points, count: int) -> Points:
-    """At most ``count`` finite ones of the points (N, 3), always the same, in their order."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) <= count:
-        return points
+def sample(points: Points, count: int) -> Rows:
+    """Rows of at most ``count`` finite ones of the points (N, 3), always the same, in their order."""
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(rows) <= count:
+        return rows
     # at random: every n-th point of an ordered scan would leave stripes
-    return points[np.sort(np.random.default_rng(0).choice(len(points), count, replace=False))]
+    return np.asarray(rows[np.sort(np.random.default_rng(0).choice(len(rows), count, replace=False))])
 
 
 def approach(local: list[Points], offset: Points) -> tuple[Points, float]:
@@ -64,10 +65,3 @@ def guess_up(points: Points) -> str:
     if low[2] > 0 and max(np.abs([low[:2], high[:2]]).max(axis=0)) < high[2]:
         return "-y"  # in front of the origin: a depth camera's frame
     return "+y"
-
-
-def chance(probability: float) -> str:
-    """Write a probability in whole per cent, never rounded to certainty."""
-    if probability > 0.99:
-        return "> 99 %"
-    return "< 1 %" if probability < 0.01 else f"{100 * probability:.0f} %"

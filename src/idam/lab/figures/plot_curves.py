@@ -8,7 +8,8 @@ from torch import Tensor
 
 from idam.lab.figures.curves import Calibration
 from idam.lab.figures.timings import Timings, growth
-from idam.report.style import BLUE, COLUMN, GREY, ORANGE, PAGE, PALETTE
+from idam.report.palette import BLUE, GREY, ORANGE, PALETTE
+from idam.report.style import COLUMN, PAGE
 
 __all__ = ["draw_calibration", "draw_iterations", "draw_timings"]
 

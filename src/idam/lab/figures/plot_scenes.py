@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from idam.lab.figures.scenes import Kept, Matches, Overlay
+from idam.report.palette import BLUE, GREEN, GREY, SOURCE, TARGET, VERMILLION
 from idam.report.panels import dot, draw_clouds, empty_grid, head, legend, project, same_scale
-from idam.report.style import BLUE, GREEN, GREY, ORANGE, PAGE, VERMILLION
+from idam.report.style import PAGE
 
 __all__ = ["draw_key_points", "draw_matches", "draw_overlays"]
 
@@ -37,13 +38,13 @@ def draw_overlays(overlays: Sequence[Overlay], up: int) -> Figure:
         source, moved, target = (
             project(cloud @ overlay.upright.T, up) for cloud in (overlay.source, overlay.moved, overlay.target)
         )
-        draw_clouds(before[column], (source, BLUE), (target, ORANGE))
-        draw_clouds(after[column], (moved, BLUE), (target, ORANGE))
+        draw_clouds(before[column], (source, SOURCE), (target, TARGET))
+        draw_clouds(after[column], (moved, SOURCE), (target, TARGET))
         same_scale([before[column], after[column]])
         if column == 0:
             for row, text in ((before, "before"), (after, "after")):
                 row[0].text(-0.05, 0.5, text, transform=row[0].transAxes, rotation=90, ha="right", va="center")
-    legend(figure, [dot(BLUE, "source"), dot(ORANGE, "target")])
+    legend(figure, [dot(SOURCE, "source"), dot(TARGET, "target")])
     return figure
 
 
