@@ -167,7 +167,9 @@ def fit(records: list[dict[str, Any]]) -> dict[str, Any]:
         return float(total)
 
     start = np.ones(len(FEATURES))
-    weights = minimize(loss, start, method="L-BFGS-B", bounds=[(0.0, None)] * len(FEATURES)).x
+    # how firmly an answer is held is known of those that were looked at closely, and ranks none
+    free = [(0.0, 0.0 if name == "fixed" else None) for name in FEATURES]
+    weights = minimize(loss, start, method="L-BFGS-B", bounds=free).x
     said, right = summaries(records, weights)
     design = np.c_[np.ones(len(said)), said]
 

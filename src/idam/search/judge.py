@@ -80,7 +80,7 @@ def features(answer: Answer | Evidence) -> Array:
             answer.close,
             -math.log(answer.off + 0.01),
             math.log(answer.border),
-            math.log(min(answer.fixed, SLIPPABLE) + 0.001),
+            math.log1p(min(answer.fixed, SLIPPABLE) / 0.001),
         ]
     )
 
