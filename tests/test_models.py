@@ -123,3 +123,8 @@ def test_unknown_devices_are_refused() -> None:
     for device in ("abacus", "cuda:99"):
         with pytest.raises(InputError, match=device):
             idam.register(SOURCE, TARGET, model="gnn-unseen-shapes", device=device)
+
+
+def test_a_device_is_refused_where_nothing_runs_on_it() -> None:
+    with pytest.raises(InputError, match="device 'cuda' has no effect: general runs on the CPU"):
+        idam.register(SOURCE, TARGET, device="cuda")

@@ -54,11 +54,16 @@ def resolve(model: str | os.PathLike[str], device: str | None = None) -> Models:
     """The models of a name: a descriptor's, a network's, or both as ``DESCRIPTOR+NETWORK``.
 
     Raises:
-        InputError: there is no such model.
+        InputError: there is no such model, or a device is given where nothing runs on one.
         MissingDependencyError: a network is named, and PyTorch is not installed.
     """
     first, plus, second = _text(model).partition("+")
     if not plus and is_descriptor(first):
+        if device not in (None, "cpu"):
+            raise InputError(
+                f"device {device!r} has no effect: {find(first).stem} runs on the CPU, without PyTorch; leave it out, "
+                "or name a network of the paper such as gnn-unseen-shapes"
+            )
         return Models(find(first).stem, load_descriptor(first))
     descriptor, network = (first, second) if plus else (DEFAULT, first)
     if is_descriptor(network) or not is_descriptor(descriptor):

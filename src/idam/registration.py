@@ -101,6 +101,7 @@ def register(
         max_correspondence_distance=solution.distance,
         information=solution.information,
         strength=solution.strength,
+        scale=solution.scale,
         matches=solution.matches,
         model=models.name,
         seconds=time.perf_counter() - started,
@@ -139,22 +140,27 @@ def check_options(
     max_angle: float, voxel_size: float | None, distance: float | None, refine: str | None, seed: int
 ) -> None:
     """Raise InputError for options out of range."""
-    if not (isinstance(max_angle, Real) and 0 < max_angle <= 180):
+    if not (_is_number(max_angle) and 0 < max_angle <= 180):
         raise InputError(f"max_angle must be a number of degrees above 0 and at most 180, not {_shown(max_angle)}")
     for name, value in (("voxel_size", voxel_size), ("max_correspondence_distance", distance)):
-        if value is not None and not (isinstance(value, Real) and math.isfinite(value) and value > 0):
+        if value is not None and not (_is_number(value) and math.isfinite(value) and value > 0):
             raise InputError(
                 f"{name} must be a positive number, not {_shown(value)}; leave it out to take it from the data"
             )
     if refine is not None and not (isinstance(refine, str) and refine in ("none", *METHODS)):
         raise InputError(f"unknown refinement {_shown(refine)}: choose {', '.join(METHODS)} or none")
-    if not (isinstance(seed, Integral) and abs(int(seed)) < 2**63):
+    if not (isinstance(seed, Integral) and _is_number(seed) and abs(int(seed)) < 2**63):
         raise InputError(f"seed must be a whole number below 2^63, not {_shown(seed)}")
 
 
 def _shown(value: Any) -> str:
     """Any value on one line of bearable length."""
     return " ".join(repr(value).split())[:60]
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is a real number, which to Python True is, too."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def prepared(data: Any, name: str) -> Prepared:

@@ -70,6 +70,8 @@ class RegistrationResult:
             radians before translation in input units, perturbed from the right in the source's frame, as GTSAM's
             ``Pose3``. Zero where too little overlaps to tell.
         strength: what the data fix of the transform and what they leave free.
+        scale: how many times as large as the source the target looks; 1 where the difference is not significant. The
+            transform does not scale.
         matches: the feature matches, and how well the answer agrees with each.
         model: names of the weights that answered.
         seconds: wall-clock time it took.
@@ -87,6 +89,7 @@ class RegistrationResult:
     max_correspondence_distance: float
     information: Array
     strength: Strength
+    scale: float
     matches: Matches
     model: str
     seconds: float
@@ -101,6 +104,15 @@ class RegistrationResult:
     def translation(self) -> Array:
         """(3,), of the transformation, in input units."""
         return self.transformation[:3, 3]
+
+    @property
+    def remark(self) -> str:
+        """What speaks against the input rather than the answer, in words: a difference in scale; else empty."""
+        if self.scale == 1.0:
+            return ""
+        ratio = 1 / self.scale
+        kind = "larger" if ratio > 1 else "smaller"
+        return f"the source looks {100 * abs(ratio - 1):.0f} % {kind} than the target; the transform does not scale it"
 
     @property
     def covariance(self) -> Array:
@@ -159,6 +171,8 @@ class RegistrationResult:
             "confidence": self.confidence,
             "converged": self.converged,
             "reason": self.reason,
+            "remark": self.remark,
+            "scale": self.scale,
             "evidence": asdict(self.evidence),
             "hypotheses": [
                 {"transformation": other.transformation.tolist(), "score": other.score} for other in self.hypotheses
@@ -180,6 +194,8 @@ class RegistrationResult:
             f"  fitness {self.fitness:.3f}, inlier RMSE {self.inlier_rmse:.4g} "
             f"(within {self.max_correspondence_distance:.4g})",
         ]
+        if self.remark:
+            lines.append(f"  {self.remark}")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:

@@ -10,6 +10,7 @@ from idam import rigid
 from idam.align import align, reaches
 from idam.align.information import information
 from idam.align.polish import finished
+from idam.align.scale import residual_scale
 from idam.clouds.pyramid import Pyramid
 from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
@@ -36,6 +37,7 @@ class Solution:
         matches: of features.
         information: (6, 6), of T exp(x), rotation before translation.
         strength: what the data fix and what they leave free.
+        scale: how many times as large as the source the target looks, 1 where that is not significant.
         distance: within which points count as inliers.
         source_misses: the distance from each point of the thinned source, moved by the answer, to the target, (N,).
         target_misses: likewise from the target to the source, (P,).
@@ -46,6 +48,7 @@ class Solution:
     matches: Matches
     information: Array
     strength: Strength
+    scale: float
     distance: float
     source_misses: Array
     target_misses: Array
@@ -71,6 +74,7 @@ class Solution:
             matches=Matches(self.matches.target, self.matches.source, self.matches.weight),
             information=rigid.carried(self.information, change),
             strength=self.strength.carried(change),
+            scale=1 / self.scale,
             source_misses=self.target_misses,
             target_misses=self.source_misses,
         )
@@ -105,6 +109,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
         ),
         information=clouds.information_left(information(pairs)),
         strength=strength(surfaces, best).carried(clouds.to_input / unit),
+        scale=residual_scale(surfaces, best, pairs),
         distance=TOUCHING * surfaces.spacing * unit,
         source_misses=unit * surfaces.nearest(best)[0],
         target_misses=unit * surfaces.swapped.nearest(rigid.inverse(best))[0],

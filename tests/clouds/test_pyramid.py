@@ -239,3 +239,10 @@ def test_information_left_is_what_small_changes_of_the_full_transform_cost(unit:
         # in working units, as the residuals were
         expected = cost(clouds.source.points, normals, full, x) / clouds.unit**2
         assert x @ information @ x == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [300, 5000])
+def test_other_units_are_named(count: int) -> None:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    with pytest.raises(InputError, match="1000 times the size of .*; if their units differ"):
+        _ = Pyramid(Prepared.of(points, "metres"), Prepared.of(1000 * points, "millimetres")).small

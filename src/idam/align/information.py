@@ -38,21 +38,22 @@ def information(pairs: Pairs) -> Array:
     weights = pairs.weights[:, None]
     gradient = pairs.gradients(pairs.normals)
     fixed = gradient.T @ (weights * gradient) * pairs.slope + 1e-9 * len(gradient) * np.eye(6)
-    variance = inflation(pairs, gradient, fixed)
+    variance = inflation(pairs, gradient, pairs.residuals, fixed)
     held = pairs.gradients(pairs.source_normals).T @ (weights * pairs.gradients(pairs.target_normals)) * pairs.slope
     values, axes = np.linalg.eigh((held + held.T) / (2 * variance))
     return np.asarray((axes * (values.clip(0) + 1)) @ axes.T)
 
 
-def inflation(pairs: Pairs, gradient: Array, fixed: Array) -> float:
+def inflation(pairs: Pairs, gradient: Array, residuals: Array, fixed: Array) -> float:
     """The variance of a residual as if they were independent: the scatter of sums over blocks, per unknown.
 
     Args:
         pairs: whose residuals they are.
         gradient: of the residuals by the K unknowns, (C, K).
+        residuals: (C,), under the fit.
         fixed: how fast the sum of what pulls falls with the unknowns, (K, K).
     """
-    pull = _sums(gradient * (pairs.weights * pairs.residuals)[:, None], _blocks(pairs.points, BLOCK))
+    pull = _sums(gradient * (pairs.weights * residuals)[:, None], _blocks(pairs.points, BLOCK))
     blocks, unknowns = pull.shape
     scatter = float(np.einsum("bi,ij,bj->", pull, np.linalg.inv(fixed), pull)) / unknowns
     # the unknowns that were fitted leave the sums so much too small

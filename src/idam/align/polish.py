@@ -27,9 +27,9 @@ than the symmetric method: with noise of 1 % of the spacing ten times as exact, 
 EACH = 2
 """Patches that a point is in, in the mean, at most: more of them cost time and know no more."""
 MOST = 10_000
-"""Patches at most. They lie around points of the source, every n-th. Around the means of voxels, a voxel that noise just
-reaches gives a patch that holds the stray point, and weighs as much as a full one: of walls along the grid, a registration
-with noise of 0.01 is then off by 0.0012 rather than 0.0005 (10^5 points; its covariance tells 0.0003)."""
+"""Patches at most. They lie around points of the source, every n-th. Around means of voxels, a voxel that noise just
+reaches gives a patch that holds the stray point and weighs as much as a full one: walls along the grid, with noise of
+0.01 and 10^5 points, then end 0.0012 off rather than 0.0003."""
 FARTHEST = 3.0
 """Spacings by which it may move the source's points (root mean square): more is not polishing, and the start stays."""
 

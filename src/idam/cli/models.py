@@ -17,7 +17,8 @@ def models() -> None:
     """List the shipped models: what each is for, what it was trained on, and its validation errors."""
     from idam.weights import DEFAULT, list_models, provenance
 
-    for name in list_models():  # no table: names and commands are to be copied, whatever the terminal's width
+    names = sorted(list_models(), key=lambda name: (name != DEFAULT, name not in USES, name))
+    for name in names:  # no table: names and commands are to be copied, whatever the terminal's width
         history = provenance(name)
         config = history["config"]
         print(f"{name}  (the default)" if name == DEFAULT else name)

@@ -40,6 +40,8 @@ def show(result: RegistrationResult, quiet: bool = False) -> None:
     print(f"confidence  {chance(result.confidence)}")
     if result.reason:
         print(f"reason      {result.reason}")
+    if result.remark:
+        print(f"remark      {result.remark}")
     print(f"time        {result.seconds:.2f} s")
 
 

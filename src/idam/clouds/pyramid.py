@@ -178,7 +178,7 @@ class Pyramid:
         both = (self.source, level.source_level), (self.target, level.target_level)
         for (cloud, thinned), (other, _) in zip(both, reversed(both), strict=True):
             left, ratio = len(thinned.points), other.radius / cloud.radius
-            if left < MIN_POINTS and ratio > ODD_SIZES:
+            if ratio > ODD_SIZES and (left < MIN_POINTS or cloud.radius < level.spacing * self.unit):
                 raise InputError(
                     f"{other.name}: {ratio:.0f} times the size of {cloud.name}; if their units differ, scale one of "
                     "them, or crop the larger cloud to the other's size"
