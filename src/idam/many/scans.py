@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from idam import io, rigid
 from idam.clouds.prepared import SMALL, Prepared
-from idam.clouds.surfaces import Surface
 from idam.errors import InputError, MissingDependencyError
 from idam.io import PointCloud, as_point_cloud, is_readable
 from idam.models import resolve
@@ -58,24 +57,35 @@ class Thinned:
     """A scan on a voxel grid, relative to its centre, in working units.
 
     Attributes:
-        surface: with covariances and a search tree.
+        points: (N, 3).
+        normals: (N, 3), of either sign unless ``faces``.
+        tree: small_gicp's search tree of the points.
         spacing: the median distance of neighbouring points.
+        faces: whether normals point to where the scan was seen from, as far as the scan shows.
     """
 
-    surface: Surface
+    points: Array
+    normals: Array
+    tree: Any
     spacing: float
-
-    @property
-    def points(self) -> Array:
-        """(N, 3)."""
-        return self.surface.points
+    faces: bool
 
 
 def thinned(scans: Sequence[Scan], unit: float) -> list[Thinned]:
     """All scans on one grid, that of the scan which needs the largest voxels."""
     voxel_size = max(scan.prepared.voxel_size(THINNED) for scan in scans)
-    levels = [scan.prepared.level(voxel_size) for scan in scans]
-    return [Thinned(level.surface(unit), level.spacing / unit) for level in levels]
+    return [_thinned(scan.prepared, voxel_size, unit) for scan in scans]
+
+
+def _thinned(prepared: Prepared, voxel_size: float, unit: float) -> Thinned:
+    level = prepared.level(voxel_size)
+    surface = level.surface(unit)
+    points, normals, faces = surface.points, surface.normals, prepared.depth is not None
+    if faces:
+        eye = -prepared.centre / unit
+        away = ((eye - points) * normals).sum(1, keepdims=True) < 0
+        normals = np.where(away, -normals, normals)
+    return Thinned(points, normals, surface.tree, level.spacing / unit, faces)
 
 
 def described(scans: Sequence[Scan]) -> tuple[list[Array], list[NDArray[np.float32]], float]:
