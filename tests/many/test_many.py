@@ -117,8 +117,8 @@ def test_a_wrong_link_is_rejected_and_says_why(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_many_scans_get_likely_partners_in_linear_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("idam.many.partners.ALL_PAIRS", 8)
-    monkeypatch.setattr("idam.many.partners.PARTNERS", 3)
+    monkeypatch.setattr("idam.many.choice.ALL_PAIRS", 8)
+    monkeypatch.setattr("idam.many.choice.PARTNERS", 3)
     for count in (8, 9, 18):
         made = world(count, points=160)
         registers = replaced(monkeypatch, Registers(made))

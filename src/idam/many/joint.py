@@ -22,12 +22,14 @@ from idam.many.graph import straight
 from idam.many.scans import Thinned
 from idam.rigid import Array, Rows
 
-__all__ = ["overlaps", "refine", "strongest"]
+__all__ = ["all_overlaps", "overlaps", "refine"]
 
 REACH = 2.0
 """Spacings within which points pull on each other: the last refinement of a pair has it, too."""
 LEAST = 0.1
 """Share of a scan's points on another from which the two count as overlapping."""
+NEARLY_ALL = 0.95
+"""Share of a scan's points that lie within its reach."""
 SAMPLE = 300
 """Points that tell the overlap."""
 PULLING = 1500
@@ -46,7 +48,7 @@ DAMPING = 1e-6
 
 def overlaps(poses: Array, surfaces: Sequence[Thinned], scans: Sequence[int]) -> dict[tuple[int, int], float]:
     """Of the pairs among some scans, the smaller number first, the share that lies on the other, from LEAST on."""
-    reach = {scan: float(np.linalg.norm(surfaces[scan].points, axis=1).max()) for scan in scans}
+    reach = {scan: float(np.quantile(np.linalg.norm(surfaces[scan].points, axis=1), NEARLY_ALL)) for scan in scans}
     shares = {}
     for i, one in enumerate(scans):
         for other in scans[i + 1 :]:
@@ -56,6 +58,13 @@ def overlaps(poses: Array, surfaces: Sequence[Thinned], scans: Sequence[int]) ->
                     covered(poses, surfaces, one, other), covered(poses, surfaces, other, one)
                 )
     return {pair: share for pair, share in shares.items() if share >= LEAST}
+
+
+def all_overlaps(
+    poses: Array, surfaces: Sequence[Thinned], components: Sequence[Sequence[int]]
+) -> dict[tuple[int, int], float]:
+    """The :func:`overlaps` within each of some components."""
+    return {pair: share for scans in components for pair, share in overlaps(poses, surfaces, scans).items()}
 
 
 def covered(poses: Array, surfaces: Sequence[Thinned], source: int, target: int) -> float:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from idam import rigid
 from idam.errors import InputError
 from idam.io.files import StrPath, one_line
 from idam.many.scans import Scan
@@ -83,7 +82,7 @@ def register_pairs(
     scans: Sequence[Scan],
     pairs: Sequence[Pair],
     options: dict[str, Any],
-    guesses: Mapping[int, Array],
+    guesses: Mapping[Pair, Array],
     kept: Kept,
     jobs: int,
     progress: Callable[[str, int, int], None],
@@ -94,7 +93,7 @@ def register_pairs(
         scans: all of them.
         pairs: their numbers.
         options: of :func:`idam.register`.
-        guesses: starting poses (4, 4) by scan, all to one frame.
+        guesses: transforms (4, 4) to consider, by pair.
         kept: what is known already, and where the rest goes.
         jobs: processes.
         progress: called with what is done, and how many of how many.
@@ -105,7 +104,7 @@ def register_pairs(
     Raises:
         InputError: a process was killed.
     """
-    asked = {pair: options | guess(pair, guesses) for pair in pairs}
+    asked = {pair: options | ({"init": guesses[pair].tolist()} if pair in guesses else {}) for pair in pairs}
     keys = {pair: key_of(scans[pair[0]], scans[pair[1]], asked[pair]) for pair in pairs}
     waiting = [pair for pair in pairs if keys[pair] not in kept.rows]
     ready = len(pairs) - len(waiting)
@@ -131,12 +130,6 @@ def key_of(source: Scan, target: Scan, options: dict[str, Any]) -> str:
     from idam import __version__
 
     return "-".join([source.fingerprint, target.fingerprint, __version__, json.dumps(options, sort_keys=True)])
-
-
-def guess(pair: Pair, guesses: Mapping[int, Array]) -> dict[str, Any]:
-    """The option that says where to begin, where both scans have starting poses."""
-    source, target = (guesses.get(scan) for scan in pair)
-    return {} if source is None or target is None else {"init": (rigid.inverse(target) @ source).tolist()}
 
 
 def results(scans: Sequence[Scan], asked: Mapping[Pair, dict[str, Any]], jobs: int) -> Iterator[tuple[Pair, Row]]:

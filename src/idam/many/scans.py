@@ -35,11 +35,13 @@ class Scan:
         name: what messages and files call it.
         cloud: as given.
         prepared: all that depends on it alone.
+        pose: (4, 4) that its file brings, to the frame of the file's scans, or None.
     """
 
     name: str
     cloud: PointCloud
     prepared: Prepared
+    pose: Array | None = None
 
     @cached_property
     def fingerprint(self) -> str:
@@ -133,8 +135,8 @@ def read_scans(scans: Iterable[Any], strict: bool = False) -> tuple[list[str], l
     return names, read
 
 
-def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple[str, Any]]]]]:
-    """What each entry is called, and how its scans are read, each with its name.
+def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple[str, Any, Array | None]]]]]:
+    """What each entry is called, and how its scans are read, each with its name and pose.
 
     A file is called by its name without the folder, anything else by its number; a folder stands for the files in it.
     """
@@ -146,20 +148,20 @@ def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple
                 yield file.name, partial(scans_of, file)
         else:
             name = f"scan{number:03d}"
-            yield name, partial(list, [(name, data)])
+            yield name, partial(list, [(name, data, None)])
 
 
-def scans_of(file: Path) -> list[tuple[str, Any]]:
-    """The scans of a file, with their names."""
-    return [(scan.name, scan.cloud) for scan in io.read_scans(file)]
+def scans_of(file: Path) -> list[tuple[str, Any, Array | None]]:
+    """The scans of a file, with their names and poses."""
+    return [(scan.name, scan.cloud, scan.pose) for scan in io.read_scans(file)]
 
 
-def ready(name: str, data: Any) -> Scan:
+def ready(name: str, data: Any, pose: Array | None) -> Scan:
     """A scan with all that depends on it alone; raise InputError where it cannot be registered."""
     if isinstance(data, Prepared):
         return Scan(name, PointCloud(data.points), data)
     cloud = as_point_cloud(data, nan="drop")
-    return Scan(name, cloud, prepared(cloud.points, name))
+    return Scan(name, cloud, prepared(cloud.points, name), pose)
 
 
 def clouds_in(folder: Path) -> list[Path]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from idam.many.graph import Links, residuals, spanning_forest
 from idam.rigid import Array, Rows
 
-__all__ = ["ALIKE", "Trust", "far_off", "weigh"]
+__all__ = ["ALIKE", "Trust", "far", "far_off", "weigh"]
 
 ALIKE = 0.3
 """Probability that a link is wrong in the way that another one is: two of 0.8 that agree make one of 0.91."""
@@ -183,9 +183,13 @@ def _contradictions(
 
 def far_off(poses: Array, links: Links) -> NDArray[np.bool_]:
     """Which links (L,) the poses make wrong beyond doubt."""
-    twist = residuals(poses, links)
-    size = np.linalg.norm(twist.reshape(-1, 2, 3), axis=-1)
-    return np.asarray((size > [WRONG_ANGLE, WRONG_SHIFT]).any(1))
+    return far(residuals(poses, links))
+
+
+def far(twist: Array) -> NDArray[np.bool_]:
+    """Whether twists (..., 6) are too large for two poses to mean the same."""
+    size = np.linalg.norm(twist.reshape(*twist.shape[:-1], 2, 3), axis=-1)
+    return np.asarray((size > [WRONG_ANGLE, WRONG_SHIFT]).any(-1))
 
 
 def _sides(count: int, links: Links, forest: list[int]) -> tuple[list[int], list[NDArray[np.bool_]]]:
