@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from idam.errors import InputError
+from idam.io import rigid_fault
 from idam.io.files import StrPath
 from idam.many import joint
 from idam.many.frame import Frame
@@ -161,6 +162,8 @@ def starting_poses(poses: Mapping[str, ArrayLike] | None, scans: list[Scan]) -> 
     if poses is not None:
         places = {scan.name: place for place, scan in enumerate(scans)}
         return {places[name]: as_rigid(matrix) for name, matrix in poses.items() if name in places}
-    brought = {place: scan.pose for place, scan in enumerate(scans) if scan.pose is not None}
+    brought = {
+        place: scan.pose for place, scan in enumerate(scans) if scan.pose is not None and not rigid_fault(scan.pose)
+    }
     different = len({pose.tobytes() for pose in brought.values()}) > 1
     return {place: as_rigid(pose) for place, pose in brought.items()} if different else {}
