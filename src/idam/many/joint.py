@@ -38,6 +38,9 @@ NEIGHBOURS = 8
 """Scans that each overlaps most, which pull on it: more would cost more, and hold no better."""
 FLAT = 1e-3
 """Variance along a point's normal, where it is 1 across: as small_gicp has it."""
+SAME = 4.0
+"""Median distances of all matches from each other's tangent planes at which one weighs a quarter: past the noise, the
+two faces of a wall remain, which pull the same way everywhere."""
 STEPS = 20
 """Steps at most."""
 STILL = 0.01
@@ -121,12 +124,20 @@ def refine(poses: Array, surfaces: Sequence[Thinned], components: Sequence[Seque
     elimination = Elimination(len(poses), source, target)
     reach = REACH * max(surfaces[scan].spacing for pair in pairs for scan in pair)
     for _ in range(STEPS):
+        relative = [rigid.inverse(poses[other]) @ poses[one] for other, one in pairs]
+        matched = [
+            correspondences(surfaces[one], surfaces[other], each, reach, PULLING)
+            for (other, one), each in zip(pairs, relative, strict=True)
+        ]
+        common = scale([
+            misses(surfaces[one], surfaces[other], each, rows)
+            for (other, one), each, rows in zip(pairs, relative, matched, strict=True)
+        ])
         diagonal, right = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
         across = np.zeros((len(pairs), 6, 6))
         for row, (other, one) in enumerate(pairs):
-            relative = rigid.inverse(poses[other]) @ poses[one]
-            hessian, gradient = linearised(surfaces[one], surfaces[other], relative, reach)
-            back = rigid.adjoint(rigid.inverse(relative))
+            hessian, gradient = linearised(surfaces[one], surfaces[other], relative[row], matched[row], common)
+            back = rigid.adjoint(rigid.inverse(relative[row]))
             diagonal[one] += hessian
             diagonal[other] += back.T @ hessian @ back
             across[row] = -hessian @ back
@@ -139,15 +150,33 @@ def refine(poses: Array, surfaces: Sequence[Thinned], components: Sequence[Seque
     return poses
 
 
-def linearised(source: Thinned, target: Thinned, relative: Array, reach: float) -> tuple[Array, Array]:
-    """H (6, 6) and b (6,) of generalised ICP at T_target_source; zeros where nothing is near."""
-    mine, theirs = correspondences(source, target, relative, reach, PULLING)
+def misses(source: Thinned, target: Thinned, relative: Array, matched: tuple[Rows, Rows]) -> Array:
+    """How far (C,) points of a source lie from the tangent planes of the points that they are matched with."""
+    mine, theirs = matched
+    apart = rigid.apply(relative, source.points[mine]) - target.points[theirs]
+    return np.asarray(np.abs((apart * target.normals[theirs]).sum(1)))
+
+
+def scale(distances: Sequence[Array]) -> float:
+    """How far surfaces lie apart that are the same, from the distances of all matches."""
+    every = np.concatenate(distances)
+    return max(SAME * float(np.median(every)), 1e-9) if len(every) else 1.0
+
+
+def linearised(
+    source: Thinned, target: Thinned, relative: Array, matched: tuple[Rows, Rows], common: float
+) -> tuple[Array, Array]:
+    """H (6, 6) and b (6,) of generalised ICP at T_target_source; matches past ``common`` weigh ever less."""
+    mine, theirs = matched
     rotation, points = relative[:3, :3], source.points[mine]
     residual = rigid.apply(relative, points) - target.points[theirs]
     spread = spreads(source.normals[mine] @ rotation.T) + spreads(target.normals[theirs])
     # T exp(x) moves a point p by R (omega x p + t): its derivative in the target's frame is R [-[p], I]
     moved = np.concatenate([-rotation @ rigid.skew(points), np.broadcast_to(rotation, (len(mine), 3, 3))], 2)
     held = np.linalg.solve(spread, np.concatenate([moved, residual[..., None]], 2))
+    # along the normals, where the two spreads add up to 2 FLAT, this is the distance
+    off = 2 * FLAT * (residual * held[..., 6]).sum(1)
+    held *= (1 + off / common**2)[:, None, None] ** -2  # Geman and McClure
     flat = moved.reshape(-1, 6)
     return flat.T @ held[..., :6].reshape(-1, 6), flat.T @ held[..., 6].ravel()
 
