@@ -16,7 +16,7 @@ from idam.io.files import StrPath
 from idam.many import joint
 from idam.many.frame import Frame
 from idam.many.choice import Choice
-from idam.many.pairs import Kept, Pair, Row, register_pairs
+from idam.many.pairs import Kept, Pair, Row, Workers, register_pairs
 from idam.many.partners import likeliness
 from idam.many.posed import Posed, pose
 from idam.many.result import MergeResult
@@ -89,12 +89,14 @@ def merge(
     choice = Choice(len(some), partners, lambda: likeliness(*described(some)))
     posed = Posed.nothing(len(some))
     pairs = choice.first(suggested.overlaps) or choice.next(posed.unsure, posed.held, {})
-    while pairs:
-        rows |= register_pairs(some, pairs, options, suggested.guesses, kept, jobs, progress)
-        progress("pose graph", 0, 1)
-        posed = pose(some, frame, rows, threshold, first)
-        unsure = sorted({*posed.unsure, *suggested.contradicted(posed)})
-        pairs = choice.next(unsure, posed.held, joint.all_overlaps(posed.poses, surfaces, posed.trust.components))
+    with Workers(some, jobs) as workers:
+        while pairs:
+            rows |= register_pairs(some, pairs, options, suggested.guesses, kept, workers, progress)
+            progress("pose graph", 0, 1)
+            posed = pose(some, frame, rows, threshold, first)
+            unsure = sorted({*posed.unsure, *suggested.contradicted(posed)})
+            overlaps = joint.all_overlaps(posed.poses, surfaces, posed.trust.components)
+            pairs = choice.next(unsure, posed.held, overlaps)
     progress("joint refinement", 0, 1)
     refined = joint.refine(posed.poses, surfaces, posed.trust.components)
     if posed.contradicts(refined):
