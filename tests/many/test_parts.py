@@ -11,10 +11,10 @@ import pytest
 from idam import rigid
 from idam.errors import InputError
 from idam.io import PointCloud
+from idam.many.choice import likeliest
 from idam.many.cloud import fuse
 from idam.many.frame import Frame
 from idam.many.pairs import Kept
-from idam.many.choice import likeliest
 from idam.many.partners import all_pairs, likeliness, vote
 from idam.many.scans import described, read_scans
 from many.worlds import world

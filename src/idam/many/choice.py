@@ -1,4 +1,4 @@
-"""Which pairs of scans to register: all of a few scans; of many the likeliest, and then those that the poses suggest."""
+"""Which pairs of scans to register: all of a few scans; of many the likeliest, then those that the poses suggest."""
 
 from __future__ import annotations
 
@@ -59,8 +59,9 @@ class Choice:
         """
         self._round += 1
         if self.partners is None and self.count <= ALL_PAIRS:
-            pairs = [pair for pair in all_pairs(self.count) if not set(pair).isdisjoint(unsure)]
-            return self._noted(set(pairs) - self.tried)
+            return self._noted(
+                {pair for pair in all_pairs(self.count) if not set(pair).isdisjoint(unsure)} - self.tried
+            )
         if self._round > 1 + MORE:
             return []
         loose = [scan for scan in range(self.count) if links[scan] < self._wanted]

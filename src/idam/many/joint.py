@@ -83,9 +83,7 @@ def every(surface: Thinned, most: int) -> Rows:
     return np.arange(0, len(surface.points), max(1, len(surface.points) // most))
 
 
-def correspondences(
-    source: Thinned, target: Thinned, relative: Array, reach: float, most: int
-) -> tuple[Rows, Rows]:
+def correspondences(source: Thinned, target: Thinned, relative: Array, reach: float, most: int) -> tuple[Rows, Rows]:
     """Rows of points of a source and of those of a target that T_target_source brings together."""
     mine = every(source, most)
     row, square = target.tree.batch_knn_search(rigid.apply(relative, source.points[mine]), 1)
@@ -129,10 +127,12 @@ def refine(poses: Array, surfaces: Sequence[Thinned], components: Sequence[Seque
             correspondences(surfaces[one], surfaces[other], each, reach, PULLING)
             for (other, one), each in zip(pairs, relative, strict=True)
         ]
-        common = scale([
-            misses(surfaces[one], surfaces[other], each, rows)
-            for (other, one), each, rows in zip(pairs, relative, matched, strict=True)
-        ])
+        common = scale(
+            [
+                misses(surfaces[one], surfaces[other], each, rows)
+                for (other, one), each, rows in zip(pairs, relative, matched, strict=True)
+            ]
+        )
         diagonal, right = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
         across = np.zeros((len(pairs), 6, 6))
         for row, (other, one) in enumerate(pairs):

@@ -14,8 +14,8 @@ from idam.errors import InputError
 from idam.io import rigid_fault
 from idam.io.files import StrPath
 from idam.many import joint
-from idam.many.frame import Frame
 from idam.many.choice import Choice
+from idam.many.frame import Frame
 from idam.many.pairs import Kept, Pair, Row, Workers, register_pairs
 from idam.many.partners import likeliness
 from idam.many.posed import Posed, pose
@@ -81,10 +81,10 @@ def merge(
     some = [scan for scan in read if isinstance(scan, Scan)]
     first = find(reference, names, some)
     options = {} if voxel_size is None else {"voxel_size": voxel_size}
-    guesses = starting_poses(poses, some)
     frame = Frame.of(some)
+    given = starting_poses(poses, some)
     surfaces = thinned(some, frame.unit)
-    suggested = Suggested.of(starting_poses(poses, some), frame, surfaces)
+    suggested = Suggested.of(given, frame, surfaces)
     rows, kept = dict[Pair, Row](), Kept(keep)
     choice = Choice(len(some), partners, lambda: likeliness(*described(some)))
     posed = Posed.nothing(len(some))

@@ -165,9 +165,7 @@ class Workers:
                 yield pair, register_pair(pair, options)
             return
         with one_thread_each():  # processes start as they are needed
-            self._pool = self._pool or ProcessPoolExecutor(
-                self._jobs, get_context("spawn"), begin, (self._prepared,)
-            )
+            self._pool = self._pool or ProcessPoolExecutor(self._jobs, get_context("spawn"), begin, (self._prepared,))
             futures = {self._pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
         try:
             for future in as_completed(futures):

@@ -8,6 +8,7 @@ matches. So the number of votes grows with the number of scans, not with its squ
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +47,11 @@ def likeliness(points: Sequence[Array], features: Sequence[Features], spacing: f
         spacing: of the points.
     """
     chosen = [np.linspace(0, len(rows) - 1, min(VOTERS, len(rows))).astype(np.int64) for rows in points]
-    points = [rows[some].astype(np.float32) for rows, some in zip(points, chosen, strict=True)]
+    places = [rows[some].astype(np.float32) for rows, some in zip(points, chosen, strict=True)]
     directions = [unit(rows[some] - rows.mean(0)) for rows, some in zip(features, chosen, strict=True)]
     scores = np.zeros((len(points), len(points)))
     for one, other in candidates(signatures(features)):
-        value = vote(points[one], directions[one], points[other], directions[other], spacing)
+        value = vote(places[one], directions[one], places[other], directions[other], spacing)
         scores[one, other] = scores[other, one] = value
     return scores
 
@@ -92,7 +93,9 @@ def nearest(features: Features, centres: Features) -> NDArray[np.int64]:
     return np.asarray(((centres**2).sum(1) - 2 * features @ centres.T).argmin(1))
 
 
-def vote(one: Array, one_features: Array, other: Array, other_features: Array, reach: float) -> float:
+def vote(
+    one: NDArray[Any], one_features: NDArray[Any], other: NDArray[Any], other_features: NDArray[Any], reach: float
+) -> float:
     """How many matches of two scans agree with the one that most agree with.
 
     Matches are mutual nearest neighbours by features; two agree where their distance is the same in both scans, to
@@ -110,6 +113,7 @@ def vote(one: Array, one_features: Array, other: Array, other_features: Array, r
     return float(both.sum(1).max())
 
 
-def unit(rows: NDArray[np.floating]) -> NDArray[np.floating]:
+def unit(rows: NDArray[Any]) -> NDArray[Any]:
     """Rows (..., K) of length one, or zero."""
-    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
+    scaled: NDArray[Any] = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
+    return scaled

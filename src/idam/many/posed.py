@@ -54,7 +54,7 @@ class Posed:
     def held(self) -> list[int]:
         """How many links hold each scan."""
         ends = np.concatenate([self.used.source, self.used.target])
-        return np.bincount(ends, minlength=len(self.poses)).tolist()
+        return [int(number) for number in np.bincount(ends, minlength=len(self.poses))]
 
     @property
     def unsure(self) -> list[int]:

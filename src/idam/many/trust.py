@@ -10,6 +10,8 @@ multiplies them: it is right with probability c; had the first gone wrong, this 
 with a probability of :data:`ALIKE`, as wrong answers do where places or objects are alike. So the odds grow by c /
 :data:`ALIKE`, where that is more than one.
 
+There confidences count for less than they say, :data:`DOUBT`; below they are taken at their word.
+
 **Against it** speaks a link of more than even odds that contradicts the poses. Either it is wrong, or one of the cuts
 on the way between its ends is: these are exclusive, each with its odds of being wrong. Look-alike places (two equal
 rooms) yield many links that agree on the wrong thing, so here only links that join places of their own count for a
@@ -96,7 +98,7 @@ def weigh(
         first: the scan that its component is measured from; None for the first of each.
     """
     count = len(poses)
-    cuts = find_cuts(poses, replace(links, confidence=doubted(links.confidence)), agrees)
+    cuts = find_cuts(poses, links, agrees)
     holding = [cut for cut in cuts if cut.probability >= threshold]
     components = _components(count, links, [cut.link for cut in holding], first)
     confidence, reason = np.zeros(count), [""] * count
@@ -133,7 +135,7 @@ def find_cuts(poses: Array, links: Links, agrees: NDArray[np.bool_]) -> list[Cut
     cautious, cuts = [], []
     for link, side in zip(forest, sides, strict=True):
         across = used[side[links.source[used]] != side[links.target[used]]]
-        sure = links.confidence[across]
+        sure = doubted(links.confidence[across])
         own = np.where(side[links.source[across]], links.source[across], links.target[across])
         other = links.source[across] + links.target[across] - own
         cautious.append(_odds(sure[_apart(own, other, near)]))

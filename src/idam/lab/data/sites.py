@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from idam import rigid
 from idam.lab.data.objects import WALL
-from idam.lab.data.raycast import Solid, cast, depth_image
+from idam.lab.data.raycast import Kind, Solid, cast, depth_image
 from idam.lab.data.scene import yawed
 from idam.lab.data.sensors import terrestrial
 
@@ -126,7 +126,7 @@ def draw_equal_rooms(points: int, rng: np.random.Generator) -> Site:
     along = size[0] + length * np.linspace(0.0, 1.0, 5)
     corridor = np.stack([along, np.full(5, middle)], 1)
     ends = np.array([[size[0], middle - half], [size[0] + length, middle + half]])
-    solids += _furniture(*ends, height, corridor, FURNITURE, rng, clear=0.35)
+    solids += _furniture(ends[0], ends[1], height, corridor, FURNITURE, rng, clear=0.35)
     return _scanned(solids, np.concatenate([inside[:4], corridor, inside[4:] + away[:2]]), points, rng)
 
 
@@ -237,7 +237,7 @@ def _furniture(
             place[1 - axis] = (low, high)[side][1 - axis] + (0.5 - side) * (size[1] + WALL / 2)
             turn = axis * np.pi / 2
         bottom = rng.uniform(0.6, height - 1.0) if kind < 0.2 else 0.0  # some hang
-        shape = "box" if kind < 0.8 else "cylinder" if kind < 0.92 else "ellipsoid"
+        shape: Kind = "box" if kind < 0.8 else "cylinder" if kind < 0.92 else "ellipsoid"
         piece = Solid(shape, np.array([*place, bottom + size[2] / 2]), size / 2, yawed(turn))
         if (np.linalg.norm(free - place, axis=1) > clear + np.hypot(size[0], size[1]) / 2).all():
             pieces.append(piece)
