@@ -1,27 +1,34 @@
-"""Merging many scans: ``idam.merge`` next to Open3D's multiway registration, and its time by the number of scans.
+"""Merging many scans: ``idam.merge`` next to Open3D's multiway registration, its growth, its trust.
 
     python benchmarks/merge.py objects FOLDER... [--voxel-size SIZE] [--json FILE]
+    python benchmarks/merge.py views MESH... [--scans 15] [--step 24] [--points 20000] [--json FILE]
     python benchmarks/merge.py rooms [--scans 60] [--points 50000] [--jobs 2] [--json FILE]
-    python benchmarks/merge.py growth [--scans 10 30 60 100 200] [--points 5000] [--json FILE]
+    python benchmarks/merge.py growth [--scans 10 25 50 100 200] [--points 3000] [--json FILE]
+    python benchmarks/merge.py trust [--graphs 40] [--json FILE]
+    python benchmarks/merge.py plot docs/results docs/images
 
 ``objects``: folders of scans with a ``pairs.json``, whose pairs compose to the true poses. Each scan is turned at
 random first. Open3D gets the pairs by FPFH, RANSAC and point-to-plane ICP with its voxel size set by hand, and idam's
 own links too; its graph starts from the spanning tree of the best fitness, every edge is uncertain (its line process),
-and its settings are those of its tutorial. ``rooms``: scans by a simulated scanner on its way through simulated rooms.
-``growth``: the same with fewer points, by the number of scans.
+and its settings are those of its tutorial. ``views``: one-sided views of meshes from all around, ray-cast. ``rooms``:
+ray-cast scans from a terrestrial scanner's way through furnished rooms. ``growth``: the same with fewer points and 4
+partners, by the number of scans. Time is CPU time of all processes, memory the most that they have together. ``trust``:
+how often poses are right by their confidence, in made-up graphs whose links are wrong once, one and a half times and
+twice as often as their confidence says. ``plot``: draws ``merge-growth.json`` and ``merge-trust.json``.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
-import resource
+import threading
 import time
 from collections.abc import Callable
 from datetime import datetime, timezone
 from importlib import import_module
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +37,11 @@ import numpy as np
 import idam
 from idam import rigid
 from idam.io import read_point_cloud
+from idam.lab.data.graphs import FAMILIES, MadeGraph, draw_graph
+from idam.lab.data.sites import Site, draw_building, draw_views
+from idam.many.graph import optimise
+from idam.many.loops import find_loops
+from idam.many.trust import far, weigh
 from idam.rigid import Array
 
 RIGHT = (2.0, 0.002)
@@ -192,92 +204,178 @@ def objects(folders: list[Path], voxel: float, jobs: int) -> list[dict[str, Any]
     return records
 
 
-# Made-up rooms
+# Ray-cast scans
 
 
-def rooms(count: int, points: int, seed: int = 0) -> tuple[list[Array], Array]:
-    """Scans from a path through a building of furnished rooms, and their poses.
-
-    The building is made of boxes; each scan sees what lies within eight metres, turned about the vertical and a little
-    tilted.
-    """
-    random = np.random.default_rng(seed)
-    length = 2.0 * count
-    boxes = [((0.0, -4.0, -0.1), (length, 4.0, 0.0))]  # the floor
-    for wall in np.arange(0.0, length + 6, 6.0):
-        boxes.append(((wall, -4.0, 0.0), (wall + 0.2, random.uniform(-1.5, 1.0), 2.8)))
-    for side in (-4.0, 4.0):
-        boxes.append(((0.0, side - 0.1, 0.0), (length, side + 0.1, 2.8)))
-    for _ in range(3 * count):  # furniture
-        low = random.uniform([0, -3.7, 0], [length, 3.2, 0.02])
-        boxes.append((tuple(low), tuple(low + random.uniform([0.2, 0.2, 0.3], [1.6, 1.2, 2.2]))))
-    cloud = np.concatenate([box_surface(np.array(low), np.array(high), random) for low, high in boxes])
-    scans, poses = [], []
-    for scan in range(count):
-        place = np.array([1.0 + 2.0 * scan * (length - 2) / length, random.uniform(-0.5, 0.5), 1.5])
-        near = cloud[np.linalg.norm(cloud - place, axis=1) < 8.0]
-        chosen = near[random.choice(len(near), min(points, len(near)), replace=False)]
-        turn = [*random.normal(scale=0.1, size=2), random.uniform(-np.pi, np.pi)]
-        pose = rigid.transform(rigid.rotation_exp(np.array(turn)), place)
-        noisy = chosen + random.normal(scale=0.005, size=chosen.shape)
-        scans.append(rigid.apply(rigid.inverse(pose), noisy))
-        poses.append(pose)
-    return scans, np.stack(poses)
-
-
-def box_surface(low: Array, high: Array, random: np.random.Generator, density: float = 400.0) -> Array:
-    """Random points on the faces of a box, so many to the square metre."""
-    size = high - low
-    faces = []
-    for axis in range(3):
-        others = [i for i in range(3) if i != axis]
-        number = max(8, int(density * size[others[0]] * size[others[1]]))
-        for end in (low, high):
-            face = random.uniform(low, high, (number, 3))
-            face[:, axis] = end[axis]
-            faces.append(face)
-    return np.concatenate(faces)
-
-
-def scenes(counts: list[int], points: int, jobs: int) -> list[dict[str, Any]]:
-    """Time, memory and errors by the number of scans."""
+def views(meshes: list[Path], count: int, step: float, points: int, jobs: int) -> list[dict[str, Any]]:
+    """Objects seen from places around their longest axis, so many degrees apart."""
+    trimesh = import_module("trimesh")
     records = []
-    for count in counts:
-        clouds, truth = rooms(count, points)
-        started, before = time.perf_counter(), os.times()
-        result = idam.merge(clouds, jobs=jobs)
-        seconds, after = time.perf_counter() - started, os.times()
-        cpu = sum(after[:4]) - sum(before[:4])
-        memory = [resource.getrusage(who).ru_maxrss / 2**20 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        largest = set(result.components[0])
-        off = errors(clouds, truth, [pose if i in largest else None for i, pose in enumerate(result.poses)])
-        record = summary(f"{count} scans of {points} points", off, seconds, (2.0, 0.1))
-        record |= {"scans": count, "points": points, "pairs": len(result.links), "cpu": cpu, "memory": memory}
-        print(f"    {len(result.links)} pairs, {cpu:.1f} s of CPU, {memory[0]:.2f} GB and {memory[1]:.2f} GB a process")
-        records.append(record)
+    for path in meshes:
+        mesh, rng = trimesh.load(path, process=False), np.random.default_rng(0)
+        axis = int(np.argmax(np.ptp(mesh.vertices, axis=0)))
+        around = np.radians(step) * np.arange(count)
+        towards = np.insert(np.stack([np.cos(around), np.sin(around)], 1), axis, rng.normal(0.15, 0.05, count), axis=1)
+        site = draw_views(np.asarray(mesh.triangles), towards, points, 0.002, rng)
+        radius = float(np.median([np.linalg.norm(scan - scan.mean(0), axis=1).max() for scan in site.scans]))
+        records.append(merged(f"{path.stem}, {count} views", site, jobs, (5.0, 0.1 * radius)))
     return records
+
+
+def rooms(counts: list[int], points: int, jobs: int, partners: int | None) -> list[dict[str, Any]]:
+    """A building, by the number of scans."""
+    sites = ((count, draw_building(count, points, np.random.default_rng(count))) for count in counts)
+    return [merged(f"{count} scans of {points} points", site, jobs, (2.0, 0.2), partners) for count, site in sites]
+
+
+def merged(name: str, site: Site, jobs: int, right: tuple[float, float], partners: int | None = None) -> dict[str, Any]:
+    """What a table says of a merge; each component's poses are compared with the truth from its own first scan."""
+    before = os.times()
+    with Memory() as memory:
+        result, seconds = timed(idam.merge, site.scans, jobs=jobs, partners=partners)
+    cpu = sum(os.times()[:4]) - sum(before[:4])
+    good = np.zeros(len(site.scans), bool)
+    for scans in result.components:
+        inside = set(scans)
+        off = site.errors([pose if i in inside else None for i, pose in enumerate(result.poses)], scans[0])
+        good |= (off[:, 0] <= right[0]) & (off[:, 1] <= right[1])
+    largest, sure = result.components[0], result.confidence >= 0.9
+    off = site.errors([pose if i in set(largest) else None for i, pose in enumerate(result.poses)], largest[0])[largest]
+    record = {
+        "name": name,
+        "scans": len(site.scans),
+        "points": round(float(np.mean([len(scan) for scan in site.scans]))),
+        "pairs": len(result.links),
+        "components": [len(scans) for scans in result.components],
+        "right_in_largest": int(good[largest].sum()),
+        "sure": int(sure.sum()),
+        "sure_and_wrong": int((sure & ~good).sum()),
+        "worst": off.max(0).tolist(),
+        "median": np.median(off, axis=0).tolist(),
+        "cpu": cpu,
+        "seconds": seconds,
+        "memory": memory.most / 2**30,
+    }
+    print(json.dumps(record), flush=True)
+    return record
+
+
+class Memory:
+    """The most memory that this process and those it started have together, looked at every second."""
+
+    def __enter__(self) -> Memory:
+        self.most, self._done = 0, threading.Event()
+        self._watch = threading.Thread(target=self._look)
+        self._watch.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        self._watch.join()
+
+    def _look(self) -> None:
+        psutil = import_module("psutil")
+        own = psutil.Process()
+        while not self._done.wait(1.0):
+            with contextlib.suppress(psutil.Error):
+                everyone = [own, *own.children(recursive=True)]
+                self.most = max(self.most, sum(process.memory_info().rss for process in everyone))
+
+
+# Trust
+
+
+def trust(graphs: int) -> list[dict[str, Any]]:
+    """How often poses are right, by their confidence, over so many graphs of each family."""
+    records = []
+    for trusting in (1.0, 1.5, 2.0):
+        for family in FAMILIES:
+            found = []
+            for number in range(graphs):
+                graph = draw_graph(np.random.default_rng([5, number]), family, trusting)
+                found += judged(graph)
+            confidence, right = np.array(found, float).reshape(-1, 2).T
+            sure = confidence >= 0.9
+            print(
+                f"{trusting:.1f} {family:<10} {sure.sum():5d} sure, {right[sure].mean():.4f} of them right", flush=True
+            )
+            records.append(
+                {"trusting": trusting, "family": family, "confidence": confidence.tolist(), "right": right.tolist()}
+            )
+    return records
+
+
+def judged(graph: MadeGraph) -> list[tuple[float, bool]]:
+    """The confidence of each scan, and whether its pose is right relative to its component's first scan."""
+    count = len(graph.poses)
+    poses, agrees = optimise(count, graph.links, find_loops(count, graph.links).closed(len(graph.links)))
+    known = weigh(poses, graph.links, agrees, [str(scan) for scan in range(count)], 0.9)
+    found = []
+    for first, *others in known.components:
+        for scan in others:
+            expected, actual = (rigid.inverse(each[first]) @ each[scan] for each in (graph.poses, poses))
+            found.append((float(known.confidence[scan]), not far(rigid.log(rigid.inverse(expected) @ actual))))
+    return found
+
+
+def plot(results: Path, images: Path) -> None:
+    """Draw growth and trust."""
+    pyplot = import_module("matplotlib.pyplot")
+    records = json.loads((results / "merge-growth.json").read_text())["records"]
+    scans = [record["scans"] for record in records]
+    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    for place, key, label in ((axes[0], "pairs", "pairs registered"), (axes[1], "cpu", "CPU time (s)")):
+        values = [record[key] for record in records]
+        place.plot(scans, values, "o-", color="#1f6f8b")
+        slope = np.dot(scans, values) / np.dot(scans, scans)
+        place.plot([0, scans[-1]], [0, slope * scans[-1]], ":", color="#888888", label=f"{slope:.2f} a scan")
+        place.set(xlabel="scans", ylabel=label, xlim=0, ylim=0)
+        place.legend(frameon=False)
+    figure.savefig(images / "merge-growth.png", dpi=110)
+    records = json.loads((results / "merge-trust.json").read_text())["records"]
+    figure, place = pyplot.subplots(figsize=(4.6, 4), layout="constrained")
+    edges = np.array([0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999, 1.001])
+    for trusting, color in ((1.0, "#1f6f8b"), (1.5, "#d08c2f"), (2.0, "#b0413e")):
+        own = [record for record in records if record["trusting"] == trusting]
+        confidence, right = (np.concatenate([record[key] for record in own]) for key in ("confidence", "right"))
+        bins = [(confidence >= low) & (confidence < high) for low, high in pairwise(edges)]
+        said, was = ([values[rows].mean() for rows in bins if rows.sum() > 20] for values in (confidence, right))
+        place.plot(said, was, "o-", color=color, label=f"links wrong {trusting:g} times as often as they say")
+    place.plot([0.7, 1], [0.7, 1], ":", color="#888888")
+    place.set(xlabel="confidence of a scan", ylabel="share that is right")
+    place.legend(frameon=False, fontsize=8)
+    figure.savefig(images / "merge-trust.png", dpi=110)
 
 
 def main() -> None:
     """Measure, print, and write with --json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["objects", "rooms", "growth"])
-    parser.add_argument("folders", type=Path, nargs="*")
+    parser.add_argument("what", choices=["objects", "views", "rooms", "growth", "trust", "plot"])
+    parser.add_argument("paths", type=Path, nargs="*")
     parser.add_argument("--voxel-size", type=float, default=0.003, help="of Open3D, set by hand")
     parser.add_argument("--scans", type=int, nargs="+")
+    parser.add_argument("--step", type=float, default=24.0, help="degrees between views")
     parser.add_argument("--points", type=int)
+    parser.add_argument("--graphs", type=int, default=40)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    if arguments.what == "objects":
-        records = objects(arguments.folders, arguments.voxel_size, arguments.jobs)
-    elif arguments.what == "rooms":
-        records = scenes(arguments.scans or [60], arguments.points or 50_000, arguments.jobs)
+    given = parser.parse_args()
+    if given.what == "plot":
+        plot(*given.paths)
+        return
+    if given.what == "objects":
+        records = objects(given.paths, given.voxel_size, given.jobs)
+    elif given.what == "views":
+        records = views(given.paths, (given.scans or [15])[0], given.step, given.points or 20_000, given.jobs)
+    elif given.what == "rooms":
+        records = rooms(given.scans or [60], given.points or 50_000, given.jobs, None)
+    elif given.what == "growth":
+        records = rooms(given.scans or [10, 25, 50, 100, 200], given.points or 3000, given.jobs, 4)
     else:
-        records = scenes(arguments.scans or [10, 30, 60, 100, 200], arguments.points or 5000, arguments.jobs)
-    if arguments.json is not None:
+        records = trust(given.graphs)
+    if given.json is not None:
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        arguments.json.write_text(json.dumps({"date": date, "idam": idam.__version__, "records": records}, indent=1))
+        given.json.write_text(json.dumps({"date": date, "idam": idam.__version__, "records": records}, indent=1))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from idam import rigid
 from idam.many.elimination import Elimination
 from idam.many.graph import (
     EVEN_ODDS,
+    PRIOR,
     Links,
     barriers,
     jacobians,
@@ -116,7 +117,7 @@ def test_thirty_percent_wrong_links_are_found_and_no_right_one(count: int, partn
     loops = find_loops(count, graph.links)
     poses, agrees = optimise(count, graph.links, loops.closed(len(graph.links)))
     assert not (agrees & graph.wrong).any()
-    assert (~agrees & ~graph.wrong).sum() <= 0.01 * len(graph.links)  # the quantile's share
+    assert (~agrees & ~graph.wrong).sum() <= 0.02 * len(graph.links)  # the quantile's share, and the unsure ones'
     assert errors(graph.poses, poses).max() < 10 * SPREAD
 
 
@@ -140,7 +141,7 @@ def test_same_links_same_bits() -> None:
 
 def test_barrier_grows_with_the_odds() -> None:
     c = np.array([0.001, 0.1, 0.5, 0.9, 0.999])
-    np.testing.assert_allclose(barriers(c), EVEN_ODDS + 2 * np.log(c / (1 - c)))
+    np.testing.assert_allclose(barriers(c), EVEN_ODDS + 2 * PRIOR * np.log(c / (1 - c)))
     assert barriers(np.array([0.0, 1.0]))[0] < 0 < barriers(np.array([0.0, 1.0]))[1] < np.inf
 
 

@@ -117,8 +117,8 @@ def test_a_wrong_link_is_rejected_and_says_why(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_many_scans_get_likely_partners_in_linear_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("idam.many.partners.ALL_PAIRS", 8)
-    monkeypatch.setattr("idam.many.partners.PARTNERS", 3)
+    monkeypatch.setattr("idam.many.choice.ALL_PAIRS", 8)
+    monkeypatch.setattr("idam.many.choice.PARTNERS", 3)
     for count in (8, 9, 18):
         made = world(count, points=160)
         registers = replaced(monkeypatch, Registers(made))
@@ -214,15 +214,87 @@ def test_fewer_than_two_scans_or_names_twice_are_refused(tmp_path: Path, object_
         merge(tmp_path / "none")
 
 
-def test_starting_poses_are_guesses(object_: tuple[World, Registers]) -> None:
+def guessed(registers: Registers) -> dict[tuple[int, int], np.ndarray]:
+    """The pairs that were registered from a starting pose, and from which."""
+    asked = zip(registers.calls, registers.options, strict=True)
+    return {pair: np.array(options["init"]) for pair, options in asked if "init" in options}
+
+
+def test_what_starting_poses_put_on_each_other_is_registered_first_and_may_be_enough(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = world(12, points=800, seen=0.35)
+    registers = replaced(monkeypatch, Registers(made))
+    anywhere = rigid.exp(np.array([0.3, 1.0, -2.0, 5.0, 6.0, 7.0]))
+    result = merge(made.scans, poses={f"scan{i:03d}": anywhere @ pose for i, pose in enumerate(made.poses)})
+    assert len(registers.calls) < 45  # of 66
+    assert result.complete
+    assert set(guessed(registers)) == set(registers.calls)
+    for pair, init in guessed(registers).items():
+        np.testing.assert_allclose(init, made.truth(*pair), atol=1e-9)
+
+
+def test_pairs_without_two_starting_poses_have_no_guess(object_: tuple[World, Registers]) -> None:
     made, registers = object_
-    poses = {f"scan{i:03d}": made.poses[i] for i in (1, 2, 4)}
-    merge(made.scans, poses=poses)
-    guessed = {
-        pair: options["init"] for pair, options in zip(registers.calls, registers.options, strict=True) if options
-    }
-    assert set(guessed) == {(1, 2), (1, 4), (2, 4)}
-    np.testing.assert_allclose(guessed[1, 4], made.truth(1, 4), atol=1e-9)
+    merge(made.scans, poses={f"scan{i:03d}": made.poses[i] for i in (1, 2, 4)})
+    assert set(guessed(registers)) <= {(1, 2), (1, 4), (2, 4)}
+    assert len(guessed(registers)) >= 2
+    assert set(registers.calls) == set(combinations(range(6), 2))
+
+
+def test_starting_poses_that_are_not_borne_out_cost_no_pair(object_: tuple[World, Registers]) -> None:
+    made, registers = object_
+    without = merge(made.scans)
+    registers.calls.clear()
+    poses = {f"scan{i:03d}": pose for i, pose in enumerate(made.poses)}
+    poses["scan002"], poses["scan003"] = poses["scan003"], poses["scan002"]
+    result = merge(made.scans, poses=poses)
+    assert {pair for pair in combinations(range(6), 2) if {2, 3} & set(pair)} <= set(registers.calls)
+    scans = list(range(6))
+    assert len(result.components) == 1
+    assert made.errors(result.poses, scans).max() < 2 * made.errors(without.poses, scans).max() + 1e-3
+
+
+def test_a_wrong_starting_pose_costs_nothing() -> None:
+    made = world(4, seed=3)
+    poses = {f"scan{i:03d}": pose for i, pose in enumerate(made.poses)}
+    poses["scan001"] = poses["scan001"] @ rigid.exp(np.array([0, 0.4, 1.0, 0.2, 0, 0]))
+    result = idam.merge(made.scans, poses=poses)
+    assert result.components == [[0, 1, 2, 3]]
+    assert made.errors(result.poses, [0, 1, 2, 3]).max() < 0.05
+    assert (result.confidence >= 0.9).all()
+
+
+def ptx(scans: list[np.ndarray], poses: np.ndarray) -> str:
+    """Scans with their poses as a PTX file."""
+    lines = []
+    for scan, pose in zip(scans, poses, strict=True):
+        lines += [str(len(scan)), "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+        lines += [" ".join(map(repr, row)) for row in pose.T.tolist()]
+        lines += [" ".join(map(repr, [*point, 0.5])) for point in scan.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def test_poses_in_a_file_are_starting_poses(object_: tuple[World, Registers], tmp_path: Path) -> None:
+    made, registers = object_
+    file = tmp_path / "site.ptx"
+    file.write_text(ptx(made.scans, made.poses))
+    result = merge(file)
+    assert result.names == [f"site.ptx#{i}" for i in range(1, 7)]
+    assert result.complete
+    assert set(guessed(registers)) == set(registers.calls)
+    for pair, init in guessed(registers).items():
+        np.testing.assert_allclose(init, made.truth(*pair), atol=1e-9)
+    registers.calls.clear()
+    registers.options.clear()
+    merge(file, poses={})  # what is given counts instead
+    assert guessed(registers) == {}
+    registers.calls.clear()
+    registers.options.clear()
+    file.write_text(ptx(made.scans, np.tile(np.eye(4), (6, 1, 1))))  # never registered
+    merge(file)
+    assert guessed(registers) == {}
+    assert len(registers.calls) == 15
 
 
 def test_a_stopped_run_goes_on_from_the_pairs_it_has(object_: tuple[World, Registers], tmp_path: Path) -> None:

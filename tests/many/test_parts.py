@@ -11,10 +11,11 @@ import pytest
 from idam import rigid
 from idam.errors import InputError
 from idam.io import PointCloud
+from idam.many.choice import likeliest
 from idam.many.cloud import fuse
 from idam.many.frame import Frame
 from idam.many.pairs import Kept
-from idam.many.partners import all_pairs, likeliest, likeliness, vote
+from idam.many.partners import all_pairs, likeliness, vote
 from idam.many.scans import described, read_scans
 from many.worlds import world
 
@@ -27,9 +28,9 @@ def test_all_pairs_are_all_pairs() -> None:
 
 def test_likeliest_partners_are_those_not_tried_yet() -> None:
     scores = np.array([[0, 3, 2, 1], [3, 0, 0, 0], [2, 0, 0, 5], [1, 0, 5, 0]], float)
-    assert likeliest(scores, 1, range(4), set()) == [(0, 1), (2, 3)]
-    assert likeliest(scores, 1, [0], {(0, 1)}) == [(0, 2)]
-    assert likeliest(scores, 9, [0], {(0, 1), (0, 2), (0, 3)}) == []
+    assert likeliest(scores, 1, range(4), set()) == {(0, 1), (2, 3)}
+    assert likeliest(scores, 1, [0], {(0, 1)}) == {(0, 2)}
+    assert likeliest(scores, 9, [0], {(0, 1), (0, 2), (0, 3)}) == set()
 
 
 def test_a_vote_for_the_same_place_beats_one_for_another() -> None:

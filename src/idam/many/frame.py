@@ -40,6 +40,12 @@ class Frame:
         shift = transformation[:3, 3] + rotation @ self.centres[source] - self.centres[target]
         return rigid.transform(rotation, shift / self.unit)
 
+    def placed(self, scans: Sequence[int], poses: Array) -> Array:
+        """Poses (M, 4, 4) from some scans' own frames to one that they share, in working coordinates."""
+        rotation = poses[:, :3, :3]
+        shift = poses[:, :3, 3] + (rotation @ self.centres[list(scans), :, None])[..., 0]
+        return rigid.transform(rotation, (shift - shift[0]) / self.unit)
+
     def covariance(self, source: int, information: Array) -> Array:
         """The covariance (6, 6) of a transform from a source, of its information in input units.
 

@@ -15,7 +15,8 @@ anything in a volume V of poses. The likelier of the two is "right" as long as :
 so that a link costs ``min(e^T Omega e, barrier)`` with a barrier that its log odds shift. Taken at its word, k grows
 with the precision of a link and would let a precise one be many standard deviations off, since V is huge; wrong answers
 of real scans lie near right ones more often than that. So k is set where a link of even odds is rejected past the 99 %
-quantile of a right one, :data:`EVEN_ODDS`.
+quantile of a right one, :data:`EVEN_ODDS`. And wrong links are not independent: those of look-alike places agree, and
+many of them, each unsure, would outvote one that is sure. So the odds count for more, :data:`PRIOR`.
 """
 
 from __future__ import annotations
@@ -34,10 +35,15 @@ __all__ = ["Links", "barriers", "jacobians", "optimise", "residuals", "solve", "
 
 EVEN_ODDS = 16.81
 """The 99 % quantile of chi-square with six degrees of freedom: the barrier of a link of even odds."""
+PRIOR = 2.0
+"""The power that the odds are raised to. Of 88 right links among 308 of a building, 21 were rejected with 1, 3 with 2
+and 4 with 4."""
 SOONER = 1.4
 """By what factor the cost moves on from convex to truncated each time: the paper's."""
 SETTLED = 1e-3
 """A weight this near 0 or 1 is decided."""
+SETTLING = 10
+"""Times that links are weighed anew at most."""
 STILL = 1e-6
 """Longest step, in working units and radians, of poses that move no more."""
 DAMPING = 1e-7
@@ -77,7 +83,7 @@ def barriers(confidence: Array) -> Array:
     Zero and less for a link so unsure that it is not believed however well it agrees.
     """
     c = np.clip(confidence, 1e-9, 1 - 1e-9)
-    return np.asarray(EVEN_ODDS + 2 * np.log(c / (1 - c)))
+    return np.asarray(EVEN_ODDS + 2 * PRIOR * np.log(c / (1 - c)))
 
 
 def residuals(poses: Array, links: Links) -> Array:
@@ -231,7 +237,10 @@ def optimise(count: int, links: Links, support: Rows) -> tuple[Array, NDArray[np
     orders = some.confidence, some.confidence + support[usable]
     forests = {tuple(spanning_forest(count, some, order)): None for order in orders}
     starts = [along(count, some, list(forest)) for forest in forests]
-    answers = [rejoined(graduated(poses, some, barrier, elimination), some, barrier, elimination) for poses in starts]
+    ways = graduated, settled
+    answers = [
+        rejoined(way(poses, some, barrier, elimination), some, barrier, elimination) for poses in starts for way in ways
+    ]
     poses = min(answers, key=lambda answer: truncated(answer, some, barrier))
     agrees = np.zeros(len(links), bool)
     agrees[usable] = misfit(poses, some) < barrier
@@ -255,6 +264,20 @@ def graduated(poses: Array, links: Links, barrier: Array, elimination: Eliminati
         sharpness *= SOONER
         if sharpness > 1 and (np.minimum(weights, 1 - weights) < SETTLED).all():
             return solve(poses, links, (excess < 1).astype(float), 30, elimination)
+
+
+def settled(poses: Array, links: Links, barrier: Array, elimination: Elimination) -> Array:
+    """Poses near those given: at once only links within their barrier pull, until they remain the same ones.
+
+    Where most links are wrong, they may pull graduated non-convexity off a start that was right.
+    """
+    agrees = misfit(poses, links) < barrier
+    for _ in range(SETTLING):
+        poses = solve(poses, links, agrees.astype(np.float64), 30, elimination)
+        before, agrees = agrees, misfit(poses, links) < barrier
+        if (agrees == before).all():
+            break
+    return poses
 
 
 def rejoined(poses: Array, links: Links, barrier: Array, elimination: Elimination) -> Array:

@@ -11,14 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from idam.errors import InputError
+from idam.io import rigid_fault
 from idam.io.files import StrPath
 from idam.many import joint
+from idam.many.choice import Choice
 from idam.many.frame import Frame
-from idam.many.pairs import Kept, Pair, Row, register_pairs
-from idam.many.partners import Choice
+from idam.many.pairs import Kept, Pair, Row, Workers, register_pairs
+from idam.many.partners import likeliness
 from idam.many.posed import Posed, pose
 from idam.many.result import MergeResult
-from idam.many.scans import Scan, read_scans, thinned
+from idam.many.scans import Scan, described, read_scans, thinned
+from idam.many.suggested import Suggested
 from idam.registration import as_rigid, check_options
 from idam.rigid import Array
 
@@ -54,12 +57,13 @@ def merge(
             in any order and any pose.
         reference: name or number of the scan whose frame its component has; None for the first scan of each component.
         voxel_size: as :func:`idam.register` takes it, for every pair.
-        partners: how many likely partners of each scan are registered with it. None for all of up to 30 scans, and 8 of
-            more; scans left unsure look for as many again, twice.
+        partners: how many likely partners of each scan are registered with it at first, and how many links each scan
+            should come to have. None for all of up to 30 scans, and 4 of more.
         jobs: processes that register pairs. With more than one, a script must start its work under
             ``if __name__ == "__main__":``, as Python's ``multiprocessing`` asks.
         threshold: probability from which a place counts as sure.
-        poses: starting poses (4, 4) by scan name, all to one frame: guesses for pairs of which both scans have one.
+        poses: starting poses (4, 4) by scan name, all to one frame; None for those that E57 and PTX files bring. Scans
+            that they put on each other are registered first, with the pose as one hypothesis among others.
         strict: whether a scan that cannot be read is an error, rather than left out.
         keep: a file that registered pairs are kept in and found again in, after a run that was stopped.
         progress: called with what is being done, and how many of how many are done.
@@ -77,16 +81,22 @@ def merge(
     some = [scan for scan in read if isinstance(scan, Scan)]
     first = find(reference, names, some)
     options = {} if voxel_size is None else {"voxel_size": voxel_size}
-    guesses = starting_poses(poses, some)
     frame = Frame.of(some)
-    posed, rows, kept = None, dict[Pair, Row](), Kept(keep)
-    choice = Choice(some, partners)
-    while pairs := choice.pairs(None if posed is None else posed.unsure):
-        rows |= register_pairs(some, pairs, options, guesses, kept, jobs, progress)
-        progress("pose graph", 0, 1)
-        posed = pose(some, frame, rows, threshold, first)
-    assert posed is not None  # two scans make a pair
+    given = starting_poses(poses, some)
     surfaces = thinned(some, frame.unit)
+    suggested = Suggested.of(given, frame, surfaces)
+    rows, kept = dict[Pair, Row](), Kept(keep)
+    choice = Choice(len(some), partners, lambda: likeliness(*described(some)))
+    posed = Posed.nothing(len(some))
+    pairs = choice.first(suggested.overlaps) or choice.next(posed.unsure, posed.held, {})
+    with Workers(some, jobs) as workers:
+        while pairs:
+            rows |= register_pairs(some, pairs, options, suggested.guesses, kept, workers, progress)
+            progress("pose graph", 0, 1)
+            posed = pose(some, frame, rows, threshold, first)
+            unsure = sorted({*posed.unsure, *suggested.contradicted(posed)})
+            overlaps = joint.all_overlaps(posed.poses, surfaces, posed.trust.components)
+            pairs = choice.next(unsure, posed.held, overlaps)
     progress("joint refinement", 0, 1)
     refined = joint.refine(posed.poses, surfaces, posed.trust.components)
     if posed.contradicts(refined):
@@ -147,6 +157,15 @@ def find(reference: str | int | None, names: list[str], scans: list[Scan]) -> in
 
 
 def starting_poses(poses: Mapping[str, ArrayLike] | None, scans: list[Scan]) -> dict[int, Array]:
-    """The starting poses (4, 4), by the scans' places."""
-    places = {scan.name: place for place, scan in enumerate(scans)}
-    return {places[name]: as_rigid(matrix) for name, matrix in (poses or {}).items() if name in places}
+    """The starting poses (4, 4), by the scans' places: those given, else those that the scans' files bring.
+
+    Poses that are all equal say nothing: that is what files hold whose scans were never registered.
+    """
+    if poses is not None:
+        places = {scan.name: place for place, scan in enumerate(scans)}
+        return {places[name]: as_rigid(matrix) for name, matrix in poses.items() if name in places}
+    brought = {
+        place: scan.pose for place, scan in enumerate(scans) if scan.pose is not None and not rigid_fault(scan.pose)
+    }
+    different = len({pose.tobytes() for pose in brought.values()}) > 1
+    return {place: as_rigid(pose) for place, pose in brought.items()} if different else {}

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from idam import rigid
 from idam.errors import InputError
 from idam.io.files import StrPath, one_line
 from idam.many.scans import Scan
 from idam.rigid import Array
 
-__all__ = ["Kept", "Pair", "register_pairs"]
+__all__ = ["Kept", "Pair", "Workers", "register_pairs"]
 
 Pair = tuple[int, int]
 """Numbers of a source and a target."""
@@ -83,9 +82,9 @@ def register_pairs(
     scans: Sequence[Scan],
     pairs: Sequence[Pair],
     options: dict[str, Any],
-    guesses: Mapping[int, Array],
+    guesses: Mapping[Pair, Array],
     kept: Kept,
-    jobs: int,
+    workers: Workers,
     progress: Callable[[str, int, int], None],
 ) -> dict[Pair, Row]:
     """Register pairs of scans, less those that are kept already.
@@ -94,9 +93,9 @@ def register_pairs(
         scans: all of them.
         pairs: their numbers.
         options: of :func:`idam.register`.
-        guesses: starting poses (4, 4) by scan, all to one frame.
+        guesses: transforms (4, 4) to consider, by pair.
         kept: what is known already, and where the rest goes.
-        jobs: processes.
+        workers: that register them.
         progress: called with what is done, and how many of how many.
 
     Returns:
@@ -105,12 +104,12 @@ def register_pairs(
     Raises:
         InputError: a process was killed.
     """
-    asked = {pair: options | guess(pair, guesses) for pair in pairs}
+    asked = {pair: options | ({"init": guesses[pair].tolist()} if pair in guesses else {}) for pair in pairs}
     keys = {pair: key_of(scans[pair[0]], scans[pair[1]], asked[pair]) for pair in pairs}
     waiting = [pair for pair in pairs if keys[pair] not in kept.rows]
     ready = len(pairs) - len(waiting)
     progress("pairs registered", ready, len(pairs))
-    for pair, row in results(scans, {pair: asked[pair] for pair in waiting}, min(jobs, len(waiting))):
+    for pair, row in workers.results({pair: asked[pair] for pair in waiting}):
         kept.add(keys[pair], {"source": scans[pair[0]].name, "target": scans[pair[1]].name, **row})
         ready += 1
         progress("pairs registered", ready, len(pairs))
@@ -133,24 +132,41 @@ def key_of(source: Scan, target: Scan, options: dict[str, Any]) -> str:
     return "-".join([source.fingerprint, target.fingerprint, __version__, json.dumps(options, sort_keys=True)])
 
 
-def guess(pair: Pair, guesses: Mapping[int, Array]) -> dict[str, Any]:
-    """The option that says where to begin, where both scans have starting poses."""
-    source, target = (guesses.get(scan) for scan in pair)
-    return {} if source is None or target is None else {"init": (rigid.inverse(target) @ source).tolist()}
+class Workers:
+    """Processes that register pairs of scans; with one, this process does.
 
+    They last until they are closed, and each keeps what it has worked out about a scan.
 
-def results(scans: Sequence[Scan], asked: Mapping[Pair, dict[str, Any]], jobs: int) -> Iterator[tuple[Pair, Row]]:
-    """Each pair's row, as soon as it is done."""
-    if jobs <= 1:
-        begin([scan.prepared for scan in scans])
-        for pair, options in asked.items():
-            yield pair, register_pair(pair, options)
-        return
-    with (
-        one_thread_each(),
-        ProcessPoolExecutor(jobs, get_context("spawn"), begin, ([scan.prepared for scan in scans],)) as pool,
-    ):
-        futures = {pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
+    Args:
+        scans: all of them.
+        jobs: processes.
+    """
+
+    def __init__(self, scans: Sequence[Scan], jobs: int):
+        self._prepared, self._jobs = [scan.prepared for scan in scans], jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def results(self, asked: Mapping[Pair, dict[str, Any]]) -> Iterator[tuple[Pair, Row]]:
+        """Each pair's row, as soon as it is done, by its options.
+
+        Raises:
+            InputError: a process was killed.
+        """
+        if self._jobs == 1 or (self._pool is None and len(asked) == 1):
+            begin(self._prepared)
+            for pair, options in asked.items():
+                yield pair, register_pair(pair, options)
+            return
+        with one_thread_each():  # processes start as they are needed
+            self._pool = self._pool or ProcessPoolExecutor(self._jobs, get_context("spawn"), begin, (self._prepared,))
+            futures = {self._pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -158,8 +174,6 @@ def results(scans: Sequence[Scan], asked: Mapping[Pair, dict[str, Any]], jobs: i
             raise InputError(
                 "a process was killed, probably for want of memory: run again with fewer jobs; what is done is kept"
             ) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextmanager

@@ -42,6 +42,20 @@ class Posed:
     links: list[Link]
     used: Links
 
+    @classmethod
+    def nothing(cls, count: int) -> Posed:
+        """Of so many scans, before any is registered."""
+        none = np.zeros(0, np.int64)
+        links = Links(none, none, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0))
+        alone = Trust([[scan] for scan in range(count)], np.zeros(count), [""] * count)
+        return cls(np.tile(np.eye(4), (count, 1, 1)), alone, [], links)
+
+    @property
+    def held(self) -> list[int]:
+        """How many links hold each scan."""
+        ends = np.concatenate([self.used.source, self.used.target])
+        return [int(number) for number in np.bincount(ends, minlength=len(self.poses))]
+
     @property
     def unsure(self) -> list[int]:
         """Scans that have no place in the largest component, or a doubtful one."""

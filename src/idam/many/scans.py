@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from idam import io, rigid
 from idam.clouds.prepared import SMALL, Prepared
-from idam.clouds.surfaces import Surface
 from idam.errors import InputError, MissingDependencyError
 from idam.io import PointCloud, as_point_cloud, is_readable
 from idam.models import resolve
@@ -36,11 +35,13 @@ class Scan:
         name: what messages and files call it.
         cloud: as given.
         prepared: all that depends on it alone.
+        pose: (4, 4) that its file brings, to the frame of the file's scans, or None.
     """
 
     name: str
     cloud: PointCloud
     prepared: Prepared
+    pose: Array | None = None
 
     @cached_property
     def fingerprint(self) -> str:
@@ -58,24 +59,35 @@ class Thinned:
     """A scan on a voxel grid, relative to its centre, in working units.
 
     Attributes:
-        surface: with covariances and a search tree.
+        points: (N, 3).
+        normals: (N, 3), of either sign unless ``faces``.
+        tree: small_gicp's search tree of the points.
         spacing: the median distance of neighbouring points.
+        faces: whether normals point to where the scan was seen from, as far as the scan shows.
     """
 
-    surface: Surface
+    points: Array
+    normals: Array
+    tree: Any
     spacing: float
-
-    @property
-    def points(self) -> Array:
-        """(N, 3)."""
-        return self.surface.points
+    faces: bool
 
 
 def thinned(scans: Sequence[Scan], unit: float) -> list[Thinned]:
     """All scans on one grid, that of the scan which needs the largest voxels."""
     voxel_size = max(scan.prepared.voxel_size(THINNED) for scan in scans)
-    levels = [scan.prepared.level(voxel_size) for scan in scans]
-    return [Thinned(level.surface(unit), level.spacing / unit) for level in levels]
+    return [_thinned(scan.prepared, voxel_size, unit) for scan in scans]
+
+
+def _thinned(prepared: Prepared, voxel_size: float, unit: float) -> Thinned:
+    level = prepared.level(voxel_size)
+    surface = level.surface(unit)
+    points, normals, faces = surface.points, surface.normals, prepared.depth is not None
+    if faces:
+        eye = -prepared.centre / unit
+        away = ((eye - points) * normals).sum(1, keepdims=True) < 0
+        normals = np.where(away, -normals, normals)
+    return Thinned(points, normals, surface.tree, level.spacing / unit, faces)
 
 
 def described(scans: Sequence[Scan]) -> tuple[list[Array], list[NDArray[np.float32]], float]:
@@ -123,8 +135,8 @@ def read_scans(scans: Iterable[Any], strict: bool = False) -> tuple[list[str], l
     return names, read
 
 
-def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple[str, Any]]]]]:
-    """What each entry is called, and how its scans are read, each with its name.
+def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple[str, Any, Array | None]]]]]:
+    """What each entry is called, and how its scans are read, each with its name and pose.
 
     A file is called by its name without the folder, anything else by its number; a folder stands for the files in it.
     """
@@ -136,20 +148,20 @@ def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple
                 yield file.name, partial(scans_of, file)
         else:
             name = f"scan{number:03d}"
-            yield name, partial(list, [(name, data)])
+            yield name, partial(list, [(name, data, None)])
 
 
-def scans_of(file: Path) -> list[tuple[str, Any]]:
-    """The scans of a file, with their names."""
-    return [(scan.name, scan.cloud) for scan in io.read_scans(file)]
+def scans_of(file: Path) -> list[tuple[str, Any, Array | None]]:
+    """The scans of a file, with their names and poses."""
+    return [(scan.name, scan.cloud, scan.pose) for scan in io.read_scans(file)]
 
 
-def ready(name: str, data: Any) -> Scan:
+def ready(name: str, data: Any, pose: Array | None) -> Scan:
     """A scan with all that depends on it alone; raise InputError where it cannot be registered."""
     if isinstance(data, Prepared):
         return Scan(name, PointCloud(data.points), data)
     cloud = as_point_cloud(data, nan="drop")
-    return Scan(name, cloud, prepared(cloud.points, name))
+    return Scan(name, cloud, prepared(cloud.points, name), pose)
 
 
 def clouds_in(folder: Path) -> list[Path]:
