@@ -244,5 +244,5 @@ def test_information_left_is_what_small_changes_of_the_full_transform_cost(unit:
 @pytest.mark.parametrize("count", [300, 5000])
 def test_other_units_are_named(count: int) -> None:
     points = np.random.default_rng(0).normal(size=(count, 3))
-    with pytest.raises(InputError, match="1000 times the size of .*; if their units differ"):
+    with pytest.raises(InputError, match=r"1000 times the size of .*; if their units differ"):
         _ = Pyramid(Prepared.of(points, "metres"), Prepared.of(1000 * points, "millimetres")).small

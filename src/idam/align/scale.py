@@ -20,7 +20,7 @@ HINT = 2.5
 """Standard errors of the scale after one step from which on it is fitted."""
 CERTAIN = 8.0
 """Standard errors from which on the fitted scale counts. Of 41 pairs of real scans, all of
-one scale, the one that looks most like another has 6.3."""
+one scale, none is told to have another; of the same 41 with one cloud 2 % larger 37, 10 % larger 37."""
 NOISE = 0.5
 """Share of the residuals' standard deviation that counts as an error of the scale, too: noise bends normals."""
 LEAST = 0.01
