@@ -140,8 +140,8 @@ def test_evidence_is_that_of_the_first_answer() -> None:
 
 
 def test_lead_is_over_the_best_other_whatever_its_place() -> None:
-    first = answer(replace(CLEAR, overlap=0.6))
-    second, third = answer(replace(CLEAR, overlap=0.5)), answer(replace(CLEAR, overlap=0.4))
+    first = answer(replace(CLEAR, support=0.6))
+    second, third = answer(replace(CLEAR, support=0.5)), answer(replace(CLEAR, support=0.4))
     lead = evidence([first, second, third]).lead
     assert lead == evidence([first, third, second]).lead == pytest.approx(weight(first) - weight(second))
     assert 0 < lead < evidence([first, third]).lead

@@ -263,12 +263,12 @@ def turned(angle: float, likelihood: float) -> Answer:
 
 def behind(best: Answer, logits: float, angle: float) -> Answer:
     """An answer that weighs so much less than another."""
-    slope = weight(Answer(np.eye(4), overlap=1.0)) - weight(Answer(np.eye(4)))
-    return replace(best, transformation=about_z(angle), overlap=best.overlap - logits / slope)
+    slope = weight(Answer(np.eye(4), support=1.0)) - weight(Answer(np.eye(4)))
+    return replace(best, transformation=about_z(angle), support=best.support - logits / slope)
 
 
 def test_of_answers_as_good_as_the_best_the_one_nearest_to_the_guess_comes_first() -> None:
-    best = Answer(about_z(180), overlap=0.9, likelihood=1.0)
+    best = Answer(about_z(180), support=0.9, likelihood=1.0)
     turn, slight = behind(best, 0.4 * TIED, 90), behind(best, 0.9 * TIED, 20)
     worse = behind(best, 1.1 * TIED, 0)
     assert smallest_rotation([best, turn, slight, worse], np.eye(4)) == [slight, best, turn, worse]
@@ -338,7 +338,7 @@ def test_judged_are_ordered_by_weight_and_those_out_of_the_question_left_as_they
     assert last is poor
     # what was a little better before is worse when it is looked at closely
     slid = replace(good, transformation=TRUTH @ rigid([0.0, 0.0, 0.3], [0.1, 0.0, 0.0]), overlap=good.overlap - 0.01)
-    answers = judged([replace(slid, likelihood=1.01 * good.likelihood), good], matching, "none", fine)
+    answers = judged([replace(slid, likelihood=1.001 * good.likelihood), good], matching, "none", fine)
     np.testing.assert_array_equal(answers[0].transformation, TRUTH)
     weights = [weight(answer) for answer in answers]
     assert weights == sorted(weights, reverse=True)
