@@ -62,7 +62,7 @@ def calls(work: Path, poses: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> lis
         return SimpleNamespace(
             transformation=rigid.inverse(poses[other]) @ poses[one],
             information=1e4 * np.eye(6),
-            confidence=0.95,
+            confidence=0.97,
             reason="",
             fitness=0.8,
             inlier_rmse=0.01,

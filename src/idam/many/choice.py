@@ -21,6 +21,10 @@ PARTNERS = 4
 """Likeliest partners of each scan that are registered where there are more scans, and links that each should have."""
 MORE = 3
 """Rounds after the first."""
+FURTHER = 2
+"""Likely partners in other components that a scan without a sure pose tries in each of them."""
+OVERLAPPING = 0.3
+"""Share that the poses must put on each other for a pair to be registered on their account: less holds little."""
 
 
 @dataclass
@@ -47,29 +51,34 @@ class Choice:
 
     def first(self, overlaps: dict[Pair, float]) -> list[Pair]:
         """The pairs that starting poses put on each other, those that most do."""
-        return self._noted(most(overlaps, range(self.count), self._wanted, self.tried))
+        return self._noted(most(overlaps, dict.fromkeys(range(self.count), self._wanted), self.tried))
 
-    def next(self, unsure: Collection[int], links: Sequence[int], overlaps: dict[Pair, float]) -> list[Pair]:
+    def next(
+        self, unsure: Collection[int], links: Sequence[int], overlaps: dict[Pair, float], component: Sequence[int]
+    ) -> list[Pair]:
         """The pairs of the next round; none where there is no more to try.
 
         Args:
             unsure: scans without a sure pose so far.
             links: of each scan, how many the poses follow.
             overlaps: by pair, the share that the poses put on each other.
+            component: the number of the one that each scan is in.
         """
         self._round += 1
         if self.partners is None and self.count <= ALL_PAIRS:
-            return self._noted(
-                {pair for pair in all_pairs(self.count) if not set(pair).isdisjoint(unsure)} - self.tried
-            )
+            pairs = {pair for pair in all_pairs(self.count) if not set(pair).isdisjoint(unsure)}
+            return self._noted(pairs - self.tried)
         if self._round > 1 + MORE:
             return []
-        loose = [scan for scan in range(self.count) if links[scan] < self._wanted]
-        pairs = most(overlaps, loose, self._wanted, self.tried)
+        enough = {pair: share for pair, share in overlaps.items() if share >= OVERLAPPING}
+        short = {scan: self._wanted - held for scan, held in enumerate(links) if held < self._wanted}
+        pairs = most(enough, short, self.tried)
         if unsure:
             if self._scores is None:
                 self._scores = self.likeliness()
-            pairs |= likeliest(self._scores, self._wanted, unsure, self.tried)
+            known = {pair for pair in all_pairs(self.count) if component[pair[0]] == component[pair[1]]}
+            each = self._wanted if self._round == 1 else FURTHER
+            pairs |= likeliest(self._scores, each, unsure, self.tried | known)
         return self._noted(pairs)
 
     @property
@@ -81,15 +90,13 @@ class Choice:
         return sorted(pairs)
 
 
-def most(shares: dict[Pair, float], scans: Collection[int], partners: int, tried: Collection[Pair]) -> set[Pair]:
-    """For each of some scans its so many partners that overlap most, among those not tried."""
-    found: dict[int, int] = dict.fromkeys(scans, 0)
-    pairs = set()
+def most(shares: dict[Pair, float], wanted: dict[int, int], tried: Collection[Pair]) -> set[Pair]:
+    """For each of some scans so many partners as it wants, those that overlap most, among the pairs not tried."""
+    left, pairs = dict(wanted), set()
     for pair in sorted(set(shares) - set(tried), key=lambda pair: (-shares[pair], pair)):
-        for scan in pair:
-            if found.get(scan, partners) < partners:
-                found[scan] += 1
-                pairs.add(pair)
+        if any(left.get(scan, 0) > 0 for scan in pair):
+            pairs.add(pair)
+            left |= {scan: left.get(scan, 0) - 1 for scan in pair}
     return pairs
 
 

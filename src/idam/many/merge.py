@@ -88,7 +88,7 @@ def merge(
     rows, kept = dict[Pair, Row](), Kept(keep)
     choice = Choice(len(some), partners, lambda: likeliness(*described(some)))
     posed = Posed.nothing(len(some))
-    pairs = choice.first(suggested.overlaps) or choice.next(posed.unsure, posed.held, {})
+    pairs = choice.first(suggested.overlaps) or choice.next(posed.unsure, posed.held, {}, range(len(some)))
     with Workers(some, jobs) as workers:
         while pairs:
             rows |= register_pairs(some, pairs, options, suggested.guesses, kept, workers, progress)
@@ -96,7 +96,7 @@ def merge(
             posed = pose(some, frame, rows, threshold, first)
             unsure = sorted({*posed.unsure, *suggested.contradicted(posed)})
             overlaps = joint.all_overlaps(posed.poses, surfaces, posed.trust.components)
-            pairs = choice.next(unsure, posed.held, overlaps)
+            pairs = choice.next(unsure, posed.held, overlaps, posed.component)
     progress("joint refinement", 0, 1)
     refined = joint.refine(posed.poses, surfaces, posed.trust.components)
     if posed.contradicts(refined):

@@ -15,6 +15,7 @@ from idam.many.graph import Links, barriers, misfit, optimise
 from idam.many.loops import Loops, find_loops
 from idam.many.pairs import Pair, Row
 from idam.many.result import Link
+from idam.many.rivals import certain
 from idam.many.scans import Scan
 from idam.many.trust import Trust, far_off, weigh
 from idam.rigid import Array
@@ -57,6 +58,12 @@ class Posed:
         return [int(number) for number in np.bincount(ends, minlength=len(self.poses))]
 
     @property
+    def component(self) -> list[int]:
+        """The number of the component that each scan is in."""
+        numbers = {scan: number for number, scans in enumerate(self.trust.components) for scan in scans}
+        return [numbers[scan] for scan in range(len(self.poses))]
+
+    @property
     def unsure(self) -> list[int]:
         """Scans that have no place in the largest component, or a doubtful one."""
         placed = set(self.trust.components[0]) if len(self.trust.components[0]) > 1 else set()
@@ -80,9 +87,10 @@ def pose(scans: Sequence[Scan], frame: Frame, rows: Mapping[Pair, Row], threshol
     pairs = sorted(pair for pair, row in rows.items() if not row["error"])
     links = working_links(frame, pairs, rows)
     loops = find_loops(len(scans), links)
-    poses, agrees = optimise(len(scans), links, loops.closed(len(links)))
+    support = loops.closed(len(links))
+    poses, agrees = optimise(len(scans), links, support)
     names = [scan.name for scan in scans]
-    trust = weigh(poses, links, agrees, names, threshold, first)
+    trust = weigh(poses, links, certain(poses, links, agrees, support, threshold), names, threshold, first)
     component = {scan: number for number, members in enumerate(trust.components) for scan in members}
     inside = np.array([component[one] == component[other] for one, other in pairs], bool).reshape(len(pairs))
     used = agrees & inside
