@@ -9,8 +9,9 @@ from idam.clouds.prepared import FINE
 from idam.errors import InputError, MissingDependencyError
 from idam.io import PointCloud, is_readable
 from idam.io.files import StrPath
-from idam.many.partners import ALL_PAIRS, Choice, all_pairs
-from idam.many.scans import Scan
+from idam.many.choice import ALL_PAIRS, PARTNERS, likeliest
+from idam.many.partners import all_pairs, likeliness
+from idam.many.scans import Scan, described
 from idam.registration import prepared
 
 __all__ = ["pairs_within"]
@@ -53,7 +54,10 @@ def choose_partners(files: list[Path], partners: int | None) -> list[tuple[int, 
         except (InputError, MissingDependencyError):
             continue
     numbers = list(scans)
-    chosen = Choice(list(scans.values()), partners).pairs(None) if len(scans) > 1 else []
+    chosen = set()
+    if len(scans) > 1:
+        scores = likeliness(*described(list(scans.values())))
+        chosen = likeliest(scores, partners or PARTNERS, range(len(scans)), ())
     unread = [(number, number - 1 if number else 1) for number in range(len(files)) if number not in scans]
     return sorted([*((numbers[source], numbers[target]) for source, target in chosen), *unread])
 
