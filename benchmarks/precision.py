@@ -3,8 +3,8 @@
     python benchmarks/precision.py [--points 1000 10000 100000 1000000] [--repeats 10] [--loops FOLDER] [--json FILE]
 
 Each pair is two samplings of one shape, each of three quarters of it, with noise: a dented sphere, a corner of walls
-along the axes, parts. Loops are three scans A, B, C of a folder with a ``pairs.json``: A to B to C against A to C, all three
-covariances carried to one frame. Answers that are wrong altogether, more than 3 degrees off, are counted apart.
+along the axes, parts. Loops are three scans A, B, C of a folder with a ``pairs.json``: A to B to C against A to C, all
+three covariances carried to one frame. Answers that are wrong altogether, more than 3 degrees off, are counted apart.
 """
 
 from __future__ import annotations
