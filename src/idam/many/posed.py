@@ -15,7 +15,6 @@ from idam.many.graph import Links, barriers, misfit, optimise
 from idam.many.loops import Loops, find_loops
 from idam.many.pairs import Pair, Row
 from idam.many.result import Link
-from idam.many.rivals import certain
 from idam.many.scans import Scan
 from idam.many.trust import Trust, far_off, weigh
 from idam.rigid import Array
@@ -87,10 +86,9 @@ def pose(scans: Sequence[Scan], frame: Frame, rows: Mapping[Pair, Row], threshol
     pairs = sorted(pair for pair, row in rows.items() if not row["error"])
     links = working_links(frame, pairs, rows)
     loops = find_loops(len(scans), links)
-    support = loops.closed(len(links))
-    poses, agrees = optimise(len(scans), links, support)
+    poses, agrees = optimise(len(scans), links, loops.closed(len(links)))
     names = [scan.name for scan in scans]
-    trust = weigh(poses, links, certain(poses, links, agrees, support, threshold), names, threshold, first)
+    trust = weigh(poses, links, agrees, names, threshold, first)
     component = {scan: number for number, members in enumerate(trust.components) for scan in members}
     inside = np.array([component[one] == component[other] for one, other in pairs], bool).reshape(len(pairs))
     used = agrees & inside

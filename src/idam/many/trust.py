@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from idam.many.graph import Links, residuals, spanning_forest
 from idam.rigid import Array, Rows
 
-__all__ = ["ALIKE", "Trust", "far", "far_off", "log_odds", "near_each_other", "places_apart", "weigh"]
+__all__ = ["ALIKE", "Trust", "doubted", "far", "far_off", "weigh"]
 
 ALIKE = 0.3
 """Probability that a link is wrong in the way that another one is: two of 0.8 that agree make one of 0.91."""
@@ -104,7 +104,7 @@ def weigh(
     confidence, reason = np.zeros(count), [""] * count
     for component in components:
         if len(component) == 1:
-            reason[component[0]] = _why_alone(component[0], links, agrees, cuts, names)
+            reason[component[0]] = _why_alone(component[0], links, cuts, names)
             continue
         confidence[component] = 1.0
         for cut in holding:
@@ -131,15 +131,15 @@ def find_cuts(poses: Array, links: Links, agrees: NDArray[np.bool_]) -> list[Cut
     used = used[np.argsort(-links.confidence[used], kind="stable")]
     forest = used[spanning_forest(len(poses), links[used], links.confidence[used])].tolist()
     tree, sides = _sides(len(poses), links, forest)
-    near = near_each_other(len(poses), links, used)
+    near = _near(len(poses), links, used)
     cautious, cuts = [], []
     for link, side in zip(forest, sides, strict=True):
         across = used[side[links.source[used]] != side[links.target[used]]]
         sure = doubted(links.confidence[across])
         own = np.where(side[links.source[across]], links.source[across], links.target[across])
         other = links.source[across] + links.target[across] - own
-        cautious.append(log_odds(sure[places_apart(own, other, near)]))
-        cuts.append(Cut(link, side, len(across), _logistic(log_odds(sure)), None))
+        cautious.append(_odds(sure[_apart(own, other, near)]))
+        cuts.append(Cut(link, side, len(across), _logistic(_odds(sure)), None))
     for row, odds in _contradictions(poses, links, agrees, near):
         source, target = int(links.source[row]), int(links.target[row])
         if tree[source] != tree[target]:
@@ -152,27 +152,26 @@ def find_cuts(poses: Array, links: Links, agrees: NDArray[np.bool_]) -> list[Cut
     return cuts
 
 
-def log_odds(sure: Array) -> float:
+def _odds(sure: Array) -> float:
     """Log odds that links (K,) of these confidences, the surest first, that agree with each other are right."""
     return _logit(sure[0]) + float(np.log(np.maximum(sure[1:] / ALIKE, 1.0)).sum())
 
 
-def near_each_other(count: int, links: Links, used: Rows) -> NDArray[np.bool_]:
+def _near(count: int, links: Links, used: Rows) -> NDArray[np.bool_]:
     """Which scans (N, N) see the same place: those with a link that agrees, and each itself."""
     near = np.eye(count, dtype=bool)
     near[links.source[used], links.target[used]] = near[links.target[used], links.source[used]] = True
     return near
 
 
-def places_apart(own: Rows, other: Rows, near: NDArray[np.bool_]) -> list[int]:
-    """Which of some links join places of their own: no two of them near each other at both ends, either way around."""
+def _apart(own: Rows, other: Rows, near: NDArray[np.bool_]) -> list[int]:
+    """Which of the links across a cut join places of their own: no two of them near each other on both sides."""
     chosen: list[int] = []
     free = np.ones(len(own), bool)
     while free.any():
         place = int(np.argmax(free))
         chosen.append(place)
-        straight = near[own[place], own] & near[other[place], other]
-        free &= ~(straight | near[own[place], other] & near[other[place], own])
+        free &= ~(near[own[place], own] & near[other[place], other])
     return chosen
 
 
@@ -240,7 +239,7 @@ def _components(count: int, links: Links, rows: list[int], first: int | None) ->
     return [sorted(scans, key=lambda scan: (scan != first, scan)) for scans in ordered]
 
 
-def _why_alone(scan: int, links: Links, agrees: NDArray[np.bool_], cuts: list[Cut], names: list[str]) -> str:
+def _why_alone(scan: int, links: Links, cuts: list[Cut], names: list[str]) -> str:
     """Why a scan has no pose."""
     own = np.flatnonzero((links.source == scan) | (links.target == scan))
     if not len(own):
@@ -249,8 +248,6 @@ def _why_alone(scan: int, links: Links, agrees: NDArray[np.bool_], cuts: list[Cu
     if against:
         return f"links contradict each other: {_told(against[0], links, names)} does not agree with the others"
     best = own[np.argmax(links.confidence[own])]
-    if not agrees[best] and doubted(links.confidence[best]) > 0.5:
-        return f"links contradict each other: {_told(int(best), links, names)} does not agree with the others"
     return f"no trustworthy link: the best is {_told(int(best), links, names)}"
 
 
