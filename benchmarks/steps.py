@@ -47,14 +47,10 @@ class Steps:
         """Points checked, strays left out, centre and radius."""
         self.clouds = Pyramid(Prepared.of(self.points[0], "source"), Prepared.of(self.points[1], "target"))
 
-    def thin(self) -> None:
-        """Voxel sizes from the ladder, and both levels."""
+    def thin_and_see_through(self) -> None:
+        """Voxel sizes from the ladder, both levels, and what scanners saw through."""
         for pair in (self.clouds.fine, self.clouds.small):
             self.spacing = pair.spacing
-
-    def find_what_scanners_saw_through(self) -> None:
-        """Depth maps, where a cloud is seen from its origin."""
-        self.space = self.clouds.free_space
 
     def trees_and_normals(self) -> None:
         """Of both levels."""
@@ -92,8 +88,7 @@ class Steps:
         """In order."""
         return [
             self.check_and_centre,
-            self.thin,
-            self.find_what_scanners_saw_through,
+            self.thin_and_see_through,
             self.trees_and_normals,
             self.neighbours_and_histograms,
             self.features_and_matches,
