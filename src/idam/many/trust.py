@@ -10,7 +10,7 @@ multiplies them: it is right with probability c; had the first gone wrong, this 
 with a probability of :data:`ALIKE`, as wrong answers do where places or objects are alike. So the odds grow by c /
 :data:`ALIKE`, where that is more than one.
 
-There confidences count for less than they say, :data:`DOUBT`; below they are taken at their word.
+Confidences count for less than they say throughout, :data:`DOUBT`.
 
 **Against it** speaks a link of more than even odds that contradicts the poses. Either it is wrong, or one of the cuts
 on the way between its ends is: these are exclusive, each with its odds of being wrong. Look-alike places (two equal
@@ -98,7 +98,7 @@ def weigh(
         first: the scan that its component is measured from; None for the first of each.
     """
     count = len(poses)
-    cuts = find_cuts(poses, links, agrees)
+    cuts = find_cuts(poses, replace(links, confidence=doubted(links.confidence)), agrees)
     holding = [cut for cut in cuts if cut.probability >= threshold]
     components = _components(count, links, [cut.link for cut in holding], first)
     confidence, reason = np.zeros(count), [""] * count
@@ -135,7 +135,7 @@ def find_cuts(poses: Array, links: Links, agrees: NDArray[np.bool_]) -> list[Cut
     cautious, cuts = [], []
     for link, side in zip(forest, sides, strict=True):
         across = used[side[links.source[used]] != side[links.target[used]]]
-        sure = doubted(links.confidence[across])
+        sure = links.confidence[across]
         own = np.where(side[links.source[across]], links.source[across], links.target[across])
         other = links.source[across] + links.target[across] - own
         cautious.append(_odds(sure[_apart(own, other, near)]))
