@@ -58,6 +58,11 @@ def test_a_loaded_model_is_ready_for_use(path):
     assert not any(p.requires_grad for p in loaded.parameters())
 
 
+def test_a_loaded_model_learns_only_where_it_is_to(path):
+    assert not any(parameter.requires_grad for parameter in load_model(path).parameters())
+    assert all(parameter.requires_grad for parameter in load_model(path, trainable=True).parameters())
+
+
 def test_loading_leaves_the_random_state_alone(path):
     before = torch.get_rng_state()
     load_model(path)

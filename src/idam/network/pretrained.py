@@ -27,15 +27,19 @@ if TYPE_CHECKING:
 __all__ = ["cached_model", "load_model", "restore", "save_model", "save_weights"]
 
 
-def load_model(name: str | os.PathLike[str] = "default", device: str | torch.device | None = None) -> IDAM:
+def load_model(
+    name: str | os.PathLike[str] = "default", device: str | torch.device | None = None, *, trainable: bool = False
+) -> IDAM:
     """A model with its weights, in single precision and evaluation mode.
 
+    Its parameters are frozen unless it is to be trained; gradients reach its inputs either way.
     Neither torch's random state nor its default dtype matters, and neither changes.
 
     Args:
         name: one of :func:`idam.list_models`, ``default``, or the path of a ``.safetensors`` file that ``idam train``
             wrote.
         device: where to put it; the CPU if None.
+        trainable: whether its parameters take gradients; call ``train()`` for training mode.
 
     Raises:
         InputError: there is no such model, or the file is not a model.
@@ -49,7 +53,7 @@ def load_model(name: str | os.PathLike[str] = "default", device: str | torch.dev
     except UNREADABLE as error:
         raise not_a_model(path, error) from None
     try:
-        return model.eval().requires_grad_(False).to(device or "cpu")
+        return model.eval().requires_grad_(trainable).to(device or "cpu")
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0][:120]
         raise InputError(f"device {str(device)!r} cannot be used ({reason}); leave it out for the CPU") from None
