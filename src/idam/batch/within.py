@@ -23,7 +23,7 @@ def pairs_within(folder: StrPath, partners: int | None = None) -> list[Pair]:
     Args:
         folder: files of other kinds in it, and folders, are passed over.
         partners: for each scan so many, the likeliest by the descriptors; None for all pairs of up to 30 scans and
-            8 partners for each of more.
+            4 partners for each of more.
 
     Raises:
         InputError: there are fewer than two scans.
