@@ -121,6 +121,30 @@ def test_thirty_percent_wrong_links_are_found_and_no_right_one(count: int, partn
     assert errors(graph.poses, poses).max() < 10 * SPREAD
 
 
+def test_a_chain_stands_among_twice_as_many_wrong_links() -> None:
+    poses = rigid.exp(RANDOM.normal(size=(16, 6)))
+    ends = [(i, i + step) for step in (1, 2) for i in range(16 - step)]
+    off = rigid.exp(RANDOM.normal(scale=SPREAD, size=(len(ends), 6)))
+    right = [(i, j, rigid.inverse(poses[j]) @ poses[i] @ each, 0.97) for (i, j), each in zip(ends, off, strict=True)]
+    far = [(i, j) for i in range(16) for j in range(i + 3, 16)]
+    wrong = [(*far[k], rigid.exp(RANDOM.normal(size=6)), RANDOM.uniform(0, 0.7)) for k in RANDOM.permutation(91)[:58]]
+    links = links_of([*right, *wrong])
+    found, agrees = optimise(16, links, find_loops(16, links).closed(len(links)))
+    np.testing.assert_array_equal(agrees, np.arange(len(links)) < len(right))
+    assert errors(poses, found).max() < 20 * SPREAD
+
+
+def test_a_sure_link_outvotes_two_unsure_ones_that_agree() -> None:
+    poses = rigid.exp(RANDOM.normal(size=(3, 6)))
+    right = [(s, t, rigid.inverse(poses[t]) @ poses[s], c) for s, t, c in ((0, 1, 0.99), (1, 2, 0.98))]
+    other = poses.copy()
+    other[2] = other[2] @ rigid.exp(np.array([0, 0, 1.0, 1.0, 0, 0]))
+    alike = [(0, 2, rigid.inverse(other[2]) @ other[0], 0.3)] * 2
+    links = links_of([*right, *alike])
+    _, agrees = optimise(3, links, np.zeros(4, np.int64))
+    assert agrees.tolist() == [True, True, False, False]
+
+
 def test_the_answer_does_not_hang_on_the_order_of_the_links() -> None:
     graph = made(15, seed=4)
     order = RANDOM.permutation(len(graph.links))

@@ -154,6 +154,22 @@ def test_broken_scans_cost_the_others_nothing(object_: tuple[World, Registers], 
         merge([*made.scans, empty], strict=True)
 
 
+def test_one_broken_file_among_twenty_scans_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made = world(20, points=200)
+    replaced(monkeypatch, Registers(made))
+    without = merge(made.scans)
+    broken = tmp_path / "broken.ply"
+    broken.write_text("ply\nformat ascii 1.0\nelement vertex 9\n")
+    result = merge([*made.scans[:7], broken, *made.scans[7:]])
+    assert "broken.ply" in result.reason[7]
+    assert result.poses[7] is None
+    assert len(result.components[0]) == 20
+    for one, other in zip(without.poses, result.poses[:7] + result.poses[8:], strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(InputError, match=r"broken\.ply"):
+        merge([*made.scans, broken], strict=True)
+
+
 def test_a_registration_that_fails_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = world(5, points=800)
     good = Registers(made)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from idam import rigid
+from idam.clouds.surfaces import Surface
 from idam.errors import InputError
 from idam.io import PointCloud
-from idam.many.choice import likeliest
+from idam.many.choice import Choice, likeliest, most
 from idam.many.cloud import fuse
 from idam.many.frame import Frame
+from idam.many.joint import correspondences, linearised, misses, scale, spreads
 from idam.many.pairs import Kept
-from idam.many.partners import all_pairs, likeliness, vote
-from idam.many.scans import described, read_scans
+from idam.many.partners import PUT_TO_VOTE, all_pairs, candidates, likeliness, signatures, vote
+from idam.many.scans import Thinned, described, read_scans
 from many.worlds import world
 
 RANDOM = np.random.default_rng(0)
@@ -31,6 +34,46 @@ def test_likeliest_partners_are_those_not_tried_yet() -> None:
     assert likeliest(scores, 1, range(4), set()) == {(0, 1), (2, 3)}
     assert likeliest(scores, 1, [0], {(0, 1)}) == {(0, 2)}
     assert likeliest(scores, 9, [0], {(0, 1), (0, 2), (0, 3)}) == set()
+
+
+def test_scans_short_of_links_get_those_they_overlap_most() -> None:
+    shares = {(0, 1): 0.9, (0, 2): 0.8, (0, 3): 0.7, (1, 2): 0.6}
+    assert most(shares, {0: 2}, set()) == {(0, 1), (0, 2)}
+    assert most(shares, {0: 2}, {(0, 1)}) == {(0, 2), (0, 3)}
+    assert most(shares, {2: 1, 1: 1}, set()) == {(0, 1), (0, 2)}
+    assert most(shares, {}, set()) == set()
+
+
+def test_unsure_scans_try_likely_ones_of_other_components_alone() -> None:
+    scores = 1 / (1.0 + np.abs(np.arange(40)[:, None] - np.arange(40)))
+    choice = Choice(40, 4, lambda: scores)
+    first = choice.next(range(40), [0] * 40, {}, range(40))
+    component = [scan % 2 for scan in range(40)]
+    again = choice.next([0, 1], [9] * 40, {}, component)
+    assert len(first) == len(set(first))
+    assert set(first).isdisjoint(again)
+    assert again
+    assert all(component[one] != component[other] and {one, other} & {0, 1} for one, other in again)
+
+
+def test_candidates_grow_with_the_number_of_scans() -> None:
+    for count in (30, 60, 120):
+        signature = RANDOM.normal(size=(count, 16))
+        pairs = candidates(signature)
+        assert len(pairs) == len(set(pairs)) <= PUT_TO_VOTE * count
+        assert all(one < other for one, other in pairs)
+        alike = signature @ signature.T - 1e9 * np.eye(count)
+        assert {tuple(sorted((i, int(alike[i].argmax())))) for i in range(count)} <= set(pairs)
+
+
+def test_signatures_tell_places_and_are_the_same_in_any_order() -> None:
+    places = [RANDOM.normal(size=(300, 16)) for _ in range(3)]
+    scans = [place + 0.1 * RANDOM.normal(size=place.shape) for place in places for _ in range(2)]
+    signature = signatures([scan.astype(np.float32) for scan in scans])
+    alike = signature @ signature.T
+    np.testing.assert_allclose(np.diag(alike), 1, atol=1e-6)
+    for scan in range(6):
+        assert np.argsort(-alike[scan])[1] // 2 == scan // 2
 
 
 def test_a_vote_for_the_same_place_beats_one_for_another() -> None:
@@ -129,3 +172,59 @@ def test_the_covariance_in_the_frame_is_that_of_the_transform() -> None:
     scatter = np.cov(rigid.log(rigid.inverse(frame.enter(0, 1, true)) @ entered).T)
     expected = frame.covariance(0, np.linalg.inv(covariance))
     np.testing.assert_allclose(scatter, expected, atol=0.08 * np.abs(expected).max())
+
+
+def wall(seen_from: float, points: int) -> Thinned:
+    """One face of a wall at x = 0, seen from in front of it or from behind, and a floor and a side that go through."""
+    grid = RANDOM.uniform(-1, 1, (points, 2))
+    faces = [np.stack([np.full(points, 0.02 * np.sign(seen_from)), grid[:, 0], grid[:, 1]], 1)]
+    rest = RANDOM.uniform(-1, 1, (2, points, 2))
+    faces += [np.stack([rest[0, :, 0], rest[0, :, 1], np.full(points, -1.0)], 1)]
+    faces += [np.stack([rest[1, :, 0], np.full(points, -1.0), rest[1, :, 1]], 1)]
+    surface = Surface.of(np.concatenate(faces))
+    away = ((np.array([seen_from, 0, 0]) - surface.points) * surface.normals).sum(1, keepdims=True) < 0
+    return Thinned(surface.points, np.where(away, -surface.normals, surface.normals), surface.tree, 0.04, True)
+
+
+def test_the_two_faces_of_a_wall_do_not_pull_on_each_other() -> None:
+    front, behind = wall(3.0, 1500), wall(-3.0, 1500)
+    mine, _ = correspondences(front, behind, np.eye(4), 0.2, 10_000)
+    inner = np.abs(front.points[mine, 0]) < 0.03
+    floor = (front.points[mine, 2] < -0.95) | (front.points[mine, 1] < -0.95)
+    assert not (inner & ~floor).any()
+    assert floor.sum() > 1000
+    unknown = replace(front, faces=False)
+    mine, _ = correspondences(unknown, behind, np.eye(4), 0.2, 10_000)
+    assert ((np.abs(front.points[mine, 0]) < 0.03) & (front.points[mine, 2] > -0.95)).sum() > 500
+
+
+def test_surfaces_apart_weigh_less_than_those_that_are_the_same() -> None:
+    """A quarter of the points seems to lie on the other face of a wall: it must not move what the rest holds."""
+    same = Surface.of(RANDOM.uniform(-1, 1, (4000, 3)) * [1, 1, 0])
+    points = same.points.copy()
+    points[:1000, 2] += 0.05
+    one = Thinned(points, np.tile([0, 0, 1.0], (4000, 1)), same.tree, 0.03, True)
+    other = Thinned(same.points, np.tile([0, 0, 1.0], (4000, 1)), same.tree, 0.03, True)
+    rows = correspondences(one, other, np.eye(4), 0.2, 10_000)
+    common = scale([misses(one, other, np.eye(4), rows) + 0.003])
+    hessian, gradient = linearised(one, other, np.eye(4), rows, common)
+    assert abs(gradient[5] / hessian[5, 5]) < 0.05 / 4 / 20
+
+
+def test_the_linear_system_is_the_derivative_of_its_cost() -> None:
+    source, target = wall(3.0, 300), wall(3.0, 300)
+    at = rigid.exp(np.array([0.01, -0.02, 0.015, 0.01, 0.0, -0.01]))
+    rows = correspondences(source, target, at, 0.3, 10_000)
+    hessian, gradient = linearised(source, target, at, rows, 1e6)  # nothing weighs less
+
+    def cost(twist: np.ndarray) -> float:
+        moved = rigid.apply(at @ rigid.exp(twist), source.points[rows[0]]) - target.points[rows[1]]
+        spread = spreads(source.normals[rows[0]] @ at[:3, :3].T) + spreads(target.normals[rows[1]])
+        return float((moved * np.linalg.solve(spread, moved[..., None])[..., 0]).sum()) / 2
+
+    step = 1e-5
+    for axis in range(6):
+        x = step * np.eye(6)[axis]
+        slope = (cost(x) - cost(-x)) / (2 * step)
+        assert slope == pytest.approx(gradient[axis], rel=1e-4, abs=1e-4 * np.abs(gradient).max())
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-6 * np.abs(hessian).max())
