@@ -13,8 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from cheap import ENVIRONMENT
 from idam import cli, rigid
 from idam.io import read_point_cloud, read_transform, write_point_cloud
+from killing import alive, descendants, processes, until
+from many.worlds import world
 
 NAMES = [f"view{i}.ply" for i in range(4)]
 
@@ -209,11 +212,33 @@ def test_run_again_it_goes_on_from_the_pairs_it_has(work: Path, call: Call, call
     assert (work / "out" / "poses.json").read_bytes() == poses
 
 
+@processes
+def test_a_killed_run_leaves_no_process_and_no_half_file_and_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    for view, scan in enumerate(world(4, seed=3, points=600, seen=0.8).scans):
+        write_point_cloud(tmp_path / "scans" / f"view{view}.ply", scan)
+    kept = tmp_path / "out" / "pairs.jsonl"
+    command = [sys.executable, "-m", "idam", "merge", str(tmp_path / "scans"), "-o", str(tmp_path / "out"), "-q"]
+    run = subprocess.Popen([*command, "--jobs", "2"], env=ENVIRONMENT, start_new_session=True)
+    assert until(lambda: kept.exists() and kept.read_bytes().count(b"\n") >= 1, 120)
+    below = descendants(run.pid)
+    run.kill()
+    run.wait()
+    assert until(lambda: not alive(below))
+    assert files_in(tmp_path / "out") == {"pairs.jsonl"}
+    done = kept.read_text().split("\n")[0]
+    assert subprocess.run([*command, "--jobs", "1"], env=ENVIRONMENT, timeout=120, check=False).returncode == 0
+    assert kept.read_text().startswith(done)
+    assert len(kept.read_text().splitlines()) == 6
+
+
 def test_fewer_scans_leave_no_transform_of_others(work: Path, call: Call, calls: list[Any]) -> None:
     call("scans", "-o", "out")
+    assert (work / "out" / "merged.ply").exists()
     call(*(f"scans/{name}" for name in NAMES[:3]), "-o", "out", "--no-cloud", "--reference", "view2.ply")
     assert {path.name for path in (work / "out" / "transforms").iterdir()} == {f"{name}.txt" for name in NAMES[:3]}
     np.testing.assert_array_equal(read_transform(work / "out" / "transforms" / "view2.ply.txt"), np.eye(4))
+    assert not (work / "out" / "merged.ply").exists()  # it would have the poses of the run before
 
 
 def test_options_reach_the_registration(work: Path, call: Call, calls: list[Any]) -> None:

@@ -21,7 +21,7 @@ PARTNERS = 4
 """Likeliest partners of each scan that are registered where there are more scans, and links that each should have."""
 MORE = 3
 """Rounds after the first."""
-FURTHER = 2
+FURTHER = 3
 """Likely partners in other components that a scan without a sure pose tries in each of them."""
 OVERLAPPING = 0.3
 """Share that the poses must put on each other for a pair to be registered on their account: less holds little."""
@@ -79,6 +79,8 @@ class Choice:
             known = {pair for pair in all_pairs(self.count) if component[pair[0]] == component[pair[1]]}
             each = self._wanted if self._round == 1 else FURTHER
             pairs |= likeliest(self._scores, each, unsure, self.tried | known)
+        if self._round == 1:  # scans mostly come in the order that they were taken in
+            pairs |= {(scan, scan + 1) for scan in range(self.count - 1)} - self.tried
         return self._noted(pairs)
 
     @property

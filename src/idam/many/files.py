@@ -46,7 +46,7 @@ def write_merge(folder: Path, result: MergeResult, cloud: bool = True) -> list[P
     write_text(folder / "poses.kitti", "".join(map(kitti, poses)))
     write_text(folder / "poses.kitti.names", "".join(f"{result.names[scan]}\n" for scan in sorted(placed)))
     write_text(folder / "graph.g2o", g2o(result))
-    for old in transforms.glob("*.txt"):  # of an earlier run with other scans
+    for old in (*transforms.glob("*.txt"), folder / "merged.ply"):  # of an earlier run with other scans or poses
         with contextlib.suppress(OSError):
             old.unlink()
     for name, pose in zip(result.names, result.poses, strict=True):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,9 @@ class Workers:
                 yield pair, register_pair(pair, options)
             return
         with one_thread_each():  # processes start as they are needed
-            self._pool = self._pool or ProcessPoolExecutor(self._jobs, get_context("spawn"), begin, (self._prepared,))
+            self._pool = self._pool or ProcessPoolExecutor(
+                self._jobs, get_context("spawn"), begin_apart, (self._prepared,)
+            )
             futures = {self._pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
         try:
             for future in as_completed(futures):
@@ -198,6 +201,19 @@ _scans: list[Any] = []
 def begin(scans: list[Any]) -> None:
     """Hand a process the scans."""
     _scans[:] = scans
+
+
+def begin_apart(scans: list[Any]) -> None:
+    """Hand a process of its own the scans; it ends with the one that started it, however that ends."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    begin(scans)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def register_pair(pair: Pair, options: dict[str, Any]) -> Row:
