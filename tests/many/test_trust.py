@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from idam import rigid
-from idam.many.graph import optimise
+from idam.many.graph import doubted, optimise
 from idam.many.loops import find_loops
-from idam.many.trust import ALIKE, Trust, doubted, weigh
+from idam.many.trust import ALIKE, Trust, weigh
 from idam.rigid import Array
 from many.graphs import SPREAD, Made, errors, links_of, made
 

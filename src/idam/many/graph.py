@@ -31,13 +31,17 @@ from idam import rigid
 from idam.many.elimination import Elimination
 from idam.rigid import Array, Rows
 
-__all__ = ["Links", "barriers", "jacobians", "optimise", "residuals", "solve", "spanning_forest"]
+__all__ = ["Links", "barriers", "doubted", "jacobians", "optimise", "residuals", "solve", "spanning_forest"]
 
 EVEN_ODDS = 16.81
 """The 99 % quantile of chi-square with six degrees of freedom: the barrier of a link of even odds."""
 PRIOR = 2.0
 """The power that the odds are raised to. Of 88 right links among 308 of a building, 21 were rejected with 1, 3 with 2
 and 4 with 4."""
+DOUBT = 2.0
+"""How many times as often as its confidence says a link may be wrong. The judge was fitted to pairs that overlap; most
+pairs that are tried here do not, and look-alike places are among them: in a building of 60 scans, 4 of the 85 links of
+0.9 and more were wrong, where their confidence says 3, and all of them had less than 0.97."""
 SOONER = 1.4
 """By what factor the cost moves on from convex to truncated each time: the paper's."""
 SETTLED = 1e-3
@@ -84,6 +88,11 @@ def barriers(confidence: Array) -> Array:
     """
     c = np.clip(confidence, 1e-9, 1 - 1e-9)
     return np.asarray(EVEN_ODDS + 2 * PRIOR * np.log(c / (1 - c)))
+
+
+def doubted(confidence: Array) -> Array:
+    """Confidences (L,) less the doubt in them."""
+    return np.asarray(np.maximum(1 - DOUBT * (1 - confidence), confidence / DOUBT))
 
 
 def residuals(poses: Array, links: Links) -> Array:
@@ -223,7 +232,7 @@ def optimise(count: int, links: Links, support: Rows) -> tuple[Array, NDArray[np
     """The poses (N, 4, 4), and which links (L,) they agree with.
 
     From two starts, the forest of the surest links and that of the links that most loops support: the answer of the
-    least truncated cost. Each set of scans that links join has a frame of its own.
+    least :func:`regret`. Each set of scans that links join has a frame of its own.
 
     Args:
         count: number of scans, N.
@@ -241,10 +250,21 @@ def optimise(count: int, links: Links, support: Rows) -> tuple[Array, NDArray[np
     answers = [
         rejoined(way(poses, some, barrier, elimination), some, barrier, elimination) for poses in starts for way in ways
     ]
-    poses = min(answers, key=lambda answer: truncated(answer, some, barrier))
+    poses = min(answers, key=lambda answer: (regret(answer, some, barrier), truncated(answer, some, barrier)))
     agrees = np.zeros(len(links), bool)
     agrees[usable] = misfit(poses, some) < barrier
     return poses, agrees
+
+
+def regret(poses: Array, links: Links, barrier: Array) -> float:
+    """The log odds of the links that poses reject, as far as these are likely to be right for all doubt.
+
+    What chooses among answers: many unsure links that agree, as those of a building folded onto itself do, sway it less
+    than the cost that each answer has minimised. Of 60 scans of a building, with 32 of 363 wrong links above 0.5, the
+    largest component has 36 by this and 22 by the cost; all are right in both.
+    """
+    sure = np.clip(doubted(links.confidence), 0.5, 1 - 1e-9)
+    return float(np.log(sure / (1 - sure))[misfit(poses, links) >= barrier].sum())
 
 
 def truncated(poses: Array, links: Links, barrier: Array) -> float:

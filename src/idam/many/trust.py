@@ -10,7 +10,7 @@ multiplies them: it is right with probability c; had the first gone wrong, this 
 with a probability of :data:`ALIKE`, as wrong answers do where places or objects are alike. So the odds grow by c /
 :data:`ALIKE`, where that is more than one.
 
-Confidences count for less than they say throughout, :data:`DOUBT`.
+Confidences count for less than they say throughout, :func:`idam.many.graph.doubted`.
 
 **Against it** speaks a link of more than even odds that contradicts the poses. Either it is wrong, or one of the cuts
 on the way between its ends is: these are exclusive, each with its odds of being wrong. Look-alike places (two equal
@@ -28,17 +28,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from idam.many.graph import Links, residuals, spanning_forest
+from idam.many.graph import Links, doubted, residuals, spanning_forest
 from idam.rigid import Array, Rows
 
-__all__ = ["ALIKE", "Trust", "doubted", "far", "far_off", "weigh"]
+__all__ = ["ALIKE", "Trust", "far", "far_off", "weigh"]
 
 ALIKE = 0.3
 """Probability that a link is wrong in the way that another one is: two of 0.8 that agree make one of 0.91."""
-DOUBT = 2.0
-"""How many times as often as its confidence says a link may be wrong. The judge was fitted to pairs that overlap; most
-pairs that are tried here do not, and look-alike places are among them: in a building of 60 scans, 4 of the 85 links of
-0.9 and more were wrong, where their confidence says 3, and all of them had less than 0.97."""
 WRONG_ANGLE = math.radians(5)
 WRONG_SHIFT = 0.1
 """What contradicts a pose: more than this off in rotation, or in radii of a scan. The confidence counts an answer as
@@ -118,11 +114,6 @@ def weigh(
             apart = f"apart from {names[components[0][0]]} and others: no trustworthy link leads there"
             reason[scan] = f"{apart}; {reason[scan]}" if reason[scan] else apart
     return Trust(components, confidence, reason)
-
-
-def doubted(confidence: Array) -> Array:
-    """Confidences (L,) less the doubt in them."""
-    return np.asarray(np.maximum(1 - DOUBT * (1 - confidence), confidence / DOUBT))
 
 
 def find_cuts(poses: Array, links: Links, agrees: NDArray[np.bool_]) -> list[Cut]:
