@@ -57,3 +57,17 @@ def test_four_networks_are_trained_alike_but_for_their_parts(script, data, tmp_p
     with pytest.raises(SystemExit):
         script.main([*words, "--precision", "32", "--batch-size", "1"])
     assert "batch" in capsys.readouterr().err
+
+
+def test_all_four_can_begin_with_the_features_of_one_model(script, tmp_path):
+    trained = load_model("gnn-unseen-categories")
+    for method in ABLATION:
+        folder = tmp_path / method
+        folder.mkdir()
+        network = load_model(script.begin_with_features("gnn-unseen-categories", method, folder))
+        assert network.config == script.CONFIGS[method]
+        for name, value in trained.features.state_dict().items():
+            assert network.features.state_dict()[name].equal(value)
+        for name, value in network.similarity.state_dict().items():
+            if name.endswith("linear.weight"):
+                assert not trained.similarity.state_dict()[name].equal(value)

@@ -21,7 +21,7 @@ def page(monkeypatch, capsys) -> str:
 
 def test_the_page_opens_with_one_table_and_one_picture(page):
     opening = page.split("\n## ")[0]
-    assert opening.startswith("# Results\n\n|  | idam | IDAM in the paper | best of others, here |")
+    assert opening.startswith("# Results\n\n|  | idam | idam with the paper's inference | IDAM in the paper |")
     assert opening.count("![") == 1
     (noise,) = (line for line in opening.splitlines() if line.startswith("| Gaussian noise"))
     assert "3.72 / 1.85 (gnn-idam)" in noise
