@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from idam.lab.evaluation.methods import METHODS
-from idam.lab.figures.timings import growth, read_timings
+from idam.lab.figures.timings import read_timings
 
 
 @pytest.fixture
@@ -58,8 +58,3 @@ def test_pairs_overlap_and_are_drawn_by_their_seed(speed):
 
 def test_networks_in_batches_are_rows_of_the_tables(speed):
     assert set(speed.NETWORKS) == {"gnn-idam", "gnn-idam-paper", "fpfh-idam", "fpfh-idam-paper"} <= set(METHODS)
-
-
-def test_growth_is_the_exponent_of_a_power():
-    assert growth({n: 0.01 * n**1.5 for n in (100, 1000, 10_000)}) == pytest.approx(1.5)
-    assert growth({100: 3.0}) is None
