@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+import small_gicp
 import torch
 from torch import Tensor
 
 from idam.network.geometry import (
     apply_transform,
+    gather_points,
     nearest,
     nearest_neighbours,
     rotation_angle,
@@ -58,7 +63,7 @@ def surface_distance(moved: Tensor, still: Tensor) -> Tensor:
 
     The nearest point of another sampling of one surface is as far as the nearest other point of the same sampling.
     """
-    own = still.gather(1, nearest_neighbours(still, 1).expand(-1, -1, 3))
+    own = gather_points(still, nearest_neighbours(still, 1).squeeze(-1))
     beyond: Tensor = nearest(moved, still)[0].sqrt().mean(-1) - (still - own).norm(dim=-1).mean(-1)
     return beyond
 
@@ -66,14 +71,26 @@ def surface_distance(moved: Tensor, still: Tensor) -> Tensor:
 def _right(whole: Tensor, found: Pose, truth: Pose, within: tuple[float, float]) -> Tensor:
     # half of the points on the other half: a copy of the same points would fit its own sampling best, however it turns
     moving, still = whole[:, ::2], apply_transform(whole[:, 1::2], *truth)
+    trees = [small_gicp.KdTree(cloud.numpy()) for cloud in still.double()]
     pose = found
     for _ in range(STEPS):
-        _, index = nearest(apply_transform(moving, *pose), still)
-        match = still.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
+        match = gather_points(still, _nearest_by_tree(apply_transform(moving, *pose), trees))
         pose = weighted_procrustes(moving, match, torch.ones_like(moving[..., 0]))
     on_itself = surface_distance(apply_transform(moving, *pose), still) < SAME_SURFACE
     right: Tensor = _near(found, truth, within) | (_near(found, pose, within) & on_itself)
     return right
+
+
+def _nearest_by_tree(points: Tensor, trees: list[Any]) -> Tensor:
+    """Rows (B, W) of the points of each tree that are nearest to those of each cloud (B, W, 3).
+
+    In an eighth of the time of all distances.
+    """
+    found = [
+        tree.batch_knn_search(cloud.numpy(), 1, num_threads=1)[0][:, 0]
+        for tree, cloud in zip(trees, points.double(), strict=True)
+    ]
+    return torch.from_numpy(np.stack(found).astype(np.int64))
 
 
 def _near(one: Pose, other: Pose, within: tuple[float, float]) -> Tensor:
