@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from idam.clouds.frame import check_points, without_strays
 from idam.clouds.surfaces import Surface, spacing_of
-from idam.clouds.viewpoint import DepthMap
+from idam.clouds.viewpoint import seen_from
 from idam.clouds.voxels import downsample, ladder, rung, rung_for
 from idam.describe.invariant import Descriptor, surroundings
 from idam.errors import InputError
@@ -130,10 +130,11 @@ class Prepared:
         return points if step is None else downsample(points, ladder(step))
 
     @cached_property
-    def depth(self) -> DepthMap | None:
-        """How far the scan sees from its frame's origin, around the centre in input units; None for no single scan."""
-        points = self._centred()
-        return DepthMap.of(points[:: len(points) // BASE + 1], -self.centre)
+    def eye(self) -> Array | None:
+        """Where the scan was taken from, (3,), relative to the centre: its frame's origin; None for no single scan."""
+        points, origin = self._centred(), -self.centre
+        surface, unit = self.level(self.voxel_size(FINE)).surface(self.unit), self.unit
+        return origin if seen_from(points[:: len(points) // BASE + 1] / unit, surface, origin / unit) else None
 
     def voxel_size(self, count: int) -> float:
         """The voxel size of the ladder that leaves at most ``count`` points, :data:`ALL` where there are no more."""

@@ -145,9 +145,9 @@ class Pyramid:
         """What the scans saw through, asked of the fine clouds."""
         voxel_size = max(cloud.voxel_size(FINE) for cloud in (self.source, self.target))
         levels = [cloud.level(voxel_size) for cloud in (self.source, self.target)]
-        depths = [cloud.depth and cloud.depth.scaled(self.unit) for cloud in (self.source, self.target)]
+        eyes = [None if cloud.eye is None else cloud.eye / self.unit for cloud in (self.source, self.target)]
         margin = MARGIN * max(level.spacing for level in levels) / self.unit
-        return FreeSpace(levels[0].points / self.unit, levels[1].points / self.unit, depths[0], depths[1], margin)
+        return FreeSpace.of(levels[0].surface(self.unit), levels[1].surface(self.unit), (eyes[0], eyes[1]), margin)
 
     def leave(self, working: Array) -> Array:
         """A working transform (..., 4, 4) as one from source to target in the input's coordinates."""

@@ -82,10 +82,9 @@ def thinned(scans: Sequence[Scan], unit: float) -> list[Thinned]:
 def _thinned(prepared: Prepared, voxel_size: float, unit: float) -> Thinned:
     level = prepared.level(voxel_size)
     surface = level.surface(unit)
-    points, normals, faces = surface.points, surface.normals, prepared.depth is not None
-    if faces:
-        eye = -prepared.centre / unit
-        away = ((eye - points) * normals).sum(1, keepdims=True) < 0
+    points, normals, faces = surface.points, surface.normals, prepared.eye is not None
+    if prepared.eye is not None:
+        away = ((prepared.eye / unit - points) * normals).sum(1, keepdims=True) < 0
         normals = np.where(away, -normals, normals)
     return Thinned(points, normals, surface.tree, level.spacing / unit, faces)
 
