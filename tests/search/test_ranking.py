@@ -9,7 +9,7 @@ import pytest
 
 from idam.align import align, reaches
 from idam.clouds.surfaces import TOUCHING, Surface, Surfaces, spacing_of
-from idam.clouds.viewpoint import DepthMap, FreeSpace
+from idam.clouds.viewpoint import FreeSpace
 from idam.search.matching import FEW, FeatureMatches, Matching
 from idam.search.overlap import exactness, shares
 from idam.search.ranking import (
@@ -236,7 +236,7 @@ def test_verified_tells_what_only_seems_to_touch_from_the_truth(matching: Matchi
 
 def test_answers_are_asked_what_they_lay_in_free_space() -> None:
     seen = room(3000)
-    space = FreeSpace(seen, seen, None, DepthMap.of(seen, np.zeros(3)), 0.05)
+    space = FreeSpace.of(Surface.of(seen), Surface.of(seen), (None, np.zeros(3)), 0.05)
     clouds = replace(level(seen, seen), free_space=space)
     matching = matching_by(clouds, np.zeros((3000, 3000)))
     wrong = by_vector([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])

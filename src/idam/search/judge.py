@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from idam.rigid import Array
-from idam.search.ranking import Answer
+from idam.search.ranking import MOST_VIOLATION, VIOLATION, Answer
 from idam.search.slides import SLIPPABLE
 
 __all__ = ["CONVERGED", "FEATURES", "LEAD", "Evidence", "confidence", "evidence", "features", "weight"]
@@ -76,7 +76,7 @@ def features(answer: Answer | Evidence) -> Array:
             answer.overlap,
             answer.contained,
             answer.support,
-            -math.log1p(min(answer.violation, 0.05) / 0.001),
+            -math.log1p(min(answer.violation, MOST_VIOLATION) / VIOLATION),
             answer.close,
             -math.log(answer.off + 0.01),
             math.log(answer.border),

@@ -29,7 +29,7 @@ STEPS = 4
 """Of the refinement on the fine clouds, where an answer comes from the coarser ones; the last one has more."""
 UNLIKELY = 0.05
 """Overlap counts for so much where the features do not speak for an answer: on flat ground they say nothing."""
-VIOLATION, MOST_VIOLATION = 0.002, 0.05
+VIOLATION, MOST_VIOLATION = 0.01, 0.1
 """Share of points where the other scan saw through that halves a score; and the most that counts, since scans of
 moving objects and bleeding edges have some in the right pose."""
 PROMISING, SLIGHT = 0.3, 0.02

@@ -20,6 +20,7 @@ from idam.search.consensus import agreeing_transforms
 from idam.search.judge import Evidence, confidence, evidence, weight
 from idam.search.matching import Matching
 from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, scored, verified
+from idam.search.repeats import repeats
 from idam.search.scope import Scope
 from idam.search.slides import held, slides
 
@@ -156,13 +157,13 @@ def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fi
     if scope.given:
         tried = np.concatenate([homed(scope.guess, matching)[None], tried])
     answers = ranked(improve(tried, matching, reaches(method)[0], method))
-    mistaken = scope.within(slides(matching.clouds.surfaces, answers[0].transformation))
-    if len(mistaken):
-        slid = likeliest(mistaken, matching, SLID)
-        answers = ranked([*answers, *improve(slid, matching, reaches(method)[0], method)])
+    surfaces, best = matching.clouds.surfaces, answers[0].transformation
+    slid, shifted = scope.within(slides(surfaces, best)), scope.within(repeats(surfaces, best))
+    rivals = np.concatenate([likeliest(slid, matching, SLID) if len(slid) else slid, shifted])
+    answers = ranked([*answers, *improve(rivals, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
     answers = smallest_rotation(judged(answers[:CONTENDERS], matching, method, fine), scope.guess)
-    return Found(answers, matching, slides=len(mistaken) > 0)
+    return Found(answers, matching, slides=len(slid) > 0)
 
 
 def homed(guess: Array, matching: Matching) -> Array:
