@@ -140,7 +140,7 @@ def judged(pair: Pair) -> dict[str, Any] | None:
             clouds, truth = clouds[::-1], rigid.inverse(truth)
         pyramid = Pyramid(*clouds)
         method = "symmetric" if pyramid.sparse else "gicp"
-        found = search(pyramid, resolve("default").descriptor, None, Scope(np.eye(4)), method)
+        found = search(pyramid, resolve("default").descriptors, None, Scope(np.eye(4)), method)
     except InputError:
         return None
     centroid, right = clouds[0].points.mean(0), []

@@ -12,7 +12,7 @@ from idam.clouds.pyramid import PairLevel
 from idam.describe.invariant import Descriptor
 from idam.errors import InputError, MissingDependencyError
 from idam.rigid import Array
-from idam.weights import DEFAULT, find, is_descriptor, load_descriptor
+from idam.weights import DEFAULT, SPARSE, find, is_descriptor, load_descriptor
 
 __all__ = ["Models", "resolve"]
 
@@ -24,6 +24,8 @@ class Models:
     Attributes:
         name: of the models, as :func:`resolve` takes it.
         descriptor: makes the features that points are matched by.
+        sparse: another that sparse clouds are matched by where that does not settle the matter; None where
+            another descriptor than the default one is named.
         idam: a network of the paper, or None.
         exchanged: whether what is searched as the source is the caller's target. The network is asked for the caller's
             source all the same: of the pairs that it was taught the source stands as the data's shapes do, and it may
@@ -32,8 +34,14 @@ class Models:
 
     name: str
     descriptor: Descriptor
+    sparse: Descriptor | None = None
     idam: Any = None
     exchanged: bool = False
+
+    @property
+    def descriptors(self) -> tuple[Descriptor, ...]:
+        """All descriptors, in the order they are asked."""
+        return (self.descriptor,) if self.sparse is None else (self.descriptor, self.sparse)
 
     def asked(self, clouds: PairLevel) -> Callable[[Array], Array] | None:
         """The network's answer to a pair of clouds, as a function of a guess (4, 4); None without a network."""
@@ -64,7 +72,8 @@ def resolve(model: str | os.PathLike[str], device: str | None = None) -> Models:
                 f"device {device!r} has no effect: {find(first).stem} runs on the CPU, without PyTorch; leave it out, "
                 "or name a network of the paper such as gnn-unseen-shapes"
             )
-        return Models(find(first).stem, load_descriptor(first))
+        second_look = load_descriptor(SPARSE) if find(first) == find(DEFAULT) else None
+        return Models(find(first).stem, load_descriptor(first), second_look)
     descriptor, network = (first, second) if plus else (DEFAULT, first)
     if is_descriptor(network) or not is_descriptor(descriptor):
         raise InputError(f"model {_text(model)!r}: give DESCRIPTOR+NETWORK, such as general+gnn-unseen-shapes")
@@ -75,7 +84,7 @@ def resolve(model: str | os.PathLike[str], device: str | None = None) -> Models:
             f"model {network!r} is a network of the paper and needs PyTorch: pip install 'idam[torch]'"
         ) from error
     name = f"{find(descriptor).stem}+{find(network).stem}"
-    return Models(name, load_descriptor(descriptor), cached_model(network, device))
+    return Models(name, load_descriptor(descriptor), idam=cached_model(network, device))
 
 
 def _text(model: Any) -> str:

@@ -92,7 +92,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     """
     method = "symmetric" if refine == "gicp" and clouds.sparse else refine or "none"
     scope = Scope(np.eye(4) if guess is None else clouds.enter(guess), max_angle, given=guess is not None)
-    found = search(clouds, models.descriptor, models.asked(clouds.small), scope, method)
+    found = search(clouds, models.descriptors, models.asked(clouds.small), scope, method)
     surfaces, unit, matches = clouds.fine.surfaces, clouds.unit, found.matching.matches
     last = refine == "gicp"  # unless another method is asked for, the last stage takes over from the search
     start = found.best if last and method != "symmetric" else align(surfaces, found.best, reaches(method)[1], method)

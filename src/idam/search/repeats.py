@@ -12,7 +12,7 @@ import numpy as np
 
 from idam import rigid
 from idam.clouds.surfaces import Surface, Surfaces
-from idam.rigid import Array
+from idam.rigid import Array, Rows
 
 __all__ = ["repeats"]
 
@@ -53,7 +53,7 @@ def _voters(surface: Surface) -> tuple[Array, Array]:
     return surface.points[rows], normals[rows]
 
 
-def _most_voted(shifts: Array, voter: Array, cell: float) -> Array:
+def _most_voted(shifts: Array, voter: Rows, cell: float) -> Array:
     """The shifts (S, 3) that most voters (V,) have one (V, 3) near, each voter counting once a cell."""
     place = np.floor(shifts / cell).astype(np.int64)
     least = place.min(0) - 1

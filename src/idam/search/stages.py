@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -93,22 +93,25 @@ class Found:
         return weight / (weight.sum() or 1.0)
 
 
-def search(clouds: Pyramid, descriptor: Descriptor, network: Network | None, scope: Scope, method: str) -> Found:
+def search(
+    clouds: Pyramid, descriptors: Sequence[Descriptor], network: Network | None, scope: Scope, method: str
+) -> Found:
     """The answers that explain both clouds best.
 
     Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
-    larger ones are, and clouds of different extent at the scale of the smaller; the best answers so far have to stand
-    against what they say. At last a network of the paper's kind, where there is one, has a say.
+    larger ones are, clouds of different extent at the scale of the smaller, and sparse ones by other features; the best
+    answers so far have to stand against what they say. At last a network of the paper's kind, where there is one, has
+    a say.
 
     Args:
         clouds: in working coordinates.
-        descriptor: makes the features that points are matched by.
+        descriptors: make the features that points are matched by; those after the first are for sparse clouds.
         network: asked from the guess.
         scope: the transforms to look into; its guess is an answer to consider.
         method: of refinement, or ``none``.
     """
     candidates = scope.guess[None]
-    for level in to_match(clouds):
+    for level, descriptor in to_match(clouds, descriptors):
         matching = Matching.of(descriptor, level)
         agreed = scope.within(agreeing_transforms(matching.matches, SPARSE_SEEDS if clouds.sparse else SEEDS))
         found = explain(np.concatenate([candidates, agreed]), matching, scope, method, clouds.fine.surfaces)
@@ -192,14 +195,17 @@ def held_poses(answers: list[Answer], matching: Matching, fine: Surfaces, method
     return [scored(pose, matching, sparse=method == "symmetric") for pose in new]
 
 
-def to_match(clouds: Pyramid) -> Iterator[PairLevel]:
-    """The clouds to match, the smallest first."""
+def to_match(clouds: Pyramid, descriptors: Sequence[Descriptor]) -> Iterator[tuple[PairLevel, Descriptor]]:
+    """The clouds to match, the smallest first, and the descriptors of their features."""
+    first, *others = descriptors
     if not clouds.all_small:
-        yield clouds.small
-    yield clouds.larger
+        yield clouds.small, first
+    yield clouds.larger, first
     shared = of_the_smaller(clouds)
     if shared is not None:
-        yield shared
+        yield shared, first
+    if clouds.sparse:
+        yield from ((clouds.small, other) for other in others)
 
 
 def of_the_smaller(clouds: Pyramid) -> PairLevel | None:
