@@ -1,4 +1,4 @@
-"""Pictures of the tables: errors in the paper's experiments, recall on pairs closer to practice, and times by size.
+"""Pictures of the tables: errors in the paper's experiments, recall on pairs closer to practice, times, and risk.
 
 python benchmarks/plot_results.py docs/images docs/results/*.json
 """
@@ -16,7 +16,7 @@ from idam.lab.evaluation.paper import PAPER
 from idam.lab.evaluation.table import order, short_name
 from idam.lab.figures.plot_curves import draw_timings
 from idam.lab.figures.timings import read_timings
-from idam.report.palette import BLUE, ORANGE, VERMILLION
+from idam.report.palette import BLUE, GREY, ORANGE, VERMILLION
 from idam.report.style import look, save
 
 ERRORS = {
@@ -25,6 +25,8 @@ ERRORS = {
     "gaussian-noise": "Gaussian noise",
 }
 RECALLS = {"practice": "rotations up to 45 degrees", "practice-any-rotation": "any rotation"}
+
+SURE = 0.9
 
 SECOND = {"symmetric_recall": "with symmetric poses", "observable_recall": "without axisymmetric shapes"}
 
@@ -96,6 +98,37 @@ def draw_recalls(rows: dict[str, Rows]) -> Figure:
     return figure
 
 
+def kind(family: str) -> str:
+    """What a family's pairs are."""
+    if family in ("part", "flange", "parts"):
+        return "parts and their models"
+    return "real scans" if family.startswith(("scans/", "real/")) else "ray-cast scenes"
+
+
+def draw_risk(records: list[dict[str, Any]]) -> Figure:
+    """The share of wrong answers among the surest pairs, by how many are taken; a dot where confidence falls to 0.9."""
+    figure = Figure((6.4, 4.0), layout="constrained")
+    axes = figure.subplots()
+    kinds: dict[str, list[dict[str, Any]]] = {"all": records}
+    for record in records:
+        kinds.setdefault(kind(record["family"]), []).append(record)
+    for (name, some), colour in zip(kinds.items(), (GREY, BLUE, ORANGE, VERMILLION), strict=True):
+        ordered = sorted(some, key=lambda record: -record["confidence"])
+        wrong = [not (record["right"] and record["known"]) for record in ordered]
+        share = [(n + 1) / len(ordered) for n in range(len(ordered))]
+        risk = [sum(wrong[: n + 1]) / (n + 1) for n in range(len(ordered))]
+        axes.plot(share, risk, color=colour, label=f"{name}, {len(ordered)} pairs")
+        sure = sum(record["confidence"] >= SURE for record in ordered)
+        if sure:
+            axes.plot(share[sure - 1], risk[sure - 1], "o", color=colour)
+    axes.set_xlabel("coverage: share of the pairs, the surest first")
+    axes.set_ylabel("risk: share of them that is wrong")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
 def main() -> None:
     """Draw what there are rows for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -108,9 +141,13 @@ def main() -> None:
             with look():
                 print(*save(draw(rows), arguments.folder / name))
     for path in arguments.records:
-        if "median_ms" in json.loads(path.read_text()):
+        record = json.loads(path.read_text())
+        if "median_ms" in record:
             with look():
                 print(*save(draw_timings(read_timings(path)), arguments.folder / "speed"))
+        if "families" in record:
+            with look():
+                print(*save(draw_risk(record["records"]), arguments.folder / "risk"))
 
 
 if __name__ == "__main__":

@@ -248,7 +248,11 @@ def trust(record: dict[str, Any]) -> str:
         f"{record['date'][:10]}, {record['processor']}. `known` counts pairs whose place something in the scene fixes; "
         "a sure answer to one of the others counts as wrong."
     )
-    return "\n".join(["## Trust", "", families(record["families"]), "", about])
+    picture = (
+        "![Risk against coverage](images/risk.png)\n\nOf the pairs, the surest first, the share that is wrong; the dots "
+        "are at a confidence of 0.9."
+    )
+    return "\n".join(["## Trust", "", picture, "", families(record["families"]), "", about])
 
 
 def families(rows: dict[str, dict[str, float]]) -> str:

@@ -111,7 +111,7 @@ def measured(folder: Path) -> Iterator[Case]:
         for pair in about["pairs"]:
             source, target = (read_point_cloud(folder / pair[side]).points for side in ("source", "target"))
             right = within(np.array(pair["transformation"]), source, *success)
-            yield Case(folder.name, pair["name"], source, target, right)
+            yield Case(f"{folder.parent.name}/{folder.name}", pair["name"], source, target, right)
     for path in sorted(folder.glob("*.npz")):
         family = path.stem.rsplit("_", 1)[0]
         held = {key: np.asarray(value, float) for key, value in np.load(path).items()}
