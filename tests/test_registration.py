@@ -136,12 +136,11 @@ def test_matches_weigh_the_more_the_closer_the_answer_brings_them(result: Regist
     assert np.corrcoef(miss[kept], matches.weight[kept])[0, 1] < -0.9
 
 
-def test_runners_up_are_other_transforms_that_score_less() -> None:
+def test_runners_up_are_other_transforms_that_explain_the_clouds_too() -> None:
     source, target = (box((1.2, 0.8, 0.5), 700, seed) for seed in (1, 2))
     result = idam.register(source, move(TRUTH, target))
     assert len(result.hypotheses) >= 3  # the half turns of a box
-    scores = [other.score for other in result.hypotheses]
-    assert scores == sorted(scores, reverse=True)
+    assert all(other.score > 0.3 for other in result.hypotheses[:3])
     for other in result.hypotheses:
         rotation = other.transformation[:3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)

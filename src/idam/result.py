@@ -43,8 +43,8 @@ class Hypothesis:
 
     Attributes:
         transformation: (4, 4), source to target coordinates, not refined on all points.
-        score: what it was ranked by (:attr:`idam.search.ranking.Answer.score`); the answer's is higher, or nearly as
-            high and the answer's rotation is smaller.
+        score: of the clouds that were matched (:attr:`idam.search.ranking.Answer.score`); the order is by what the fine
+            clouds say, too.
     """
 
     transformation: Array

@@ -194,7 +194,8 @@ def test_how_far_behind_it_is_counts_up_to_a_point() -> None:
 def test_confident_of_a_clean_pair_and_not_of_nothing() -> None:
     assert confidence(CLEAR) > 0.9
     assert confidence(NOTHING) < 0.5
-    assert confidence(replace(NOTHING, lead=LEAD)) < 0.5
+    nothing = Answer(np.eye(4))
+    assert confidence(evidence([nothing])) < 0.1
 
 
 @pytest.mark.parametrize(("name", "value"), [("likelihood", 1e300), ("likelihood", -1e300), ("lead", -1e300)])
