@@ -76,12 +76,15 @@ class Pairs:
         source_normals: (C, 3).
         target_normals: (C, 3), to the same side.
         gaps: vectors from the target's centre to the source's, (C, 3).
+        response: what the residuals change by as the source moves, as a share of the way: below 1 where the means of
+            patches follow the place that they are asked for at.
     """
 
     points: Array
     source_normals: Array
     target_normals: Array
     gaps: Array
+    response: float = 1.0
 
     @classmethod
     def of_points(cls, surfaces: Surfaces, transformation: Array) -> Pairs:
@@ -134,9 +137,9 @@ class Pairs:
 
     @cached_property
     def slope(self) -> float:
-        """What a weighted residual grows by with the residual, over the mean weight: below 1, as weights fall."""
+        """What a weighted residual grows by as the source moves, over the mean weight: below 1, as weights fall."""
         growth = (1 - 3 * self._relative) * (1 + self._relative) ** -3
-        return float(growth.mean() / self.weights.mean())
+        return self.response * float(growth.mean() / self.weights.mean())
 
     @cached_property
     def scale(self) -> float:
