@@ -669,7 +669,7 @@ def test_refuses_a_voxel_size_that_leaves_more_than_memory_holds() -> None:
         ("model", "nosuch", "gnn-unseen-shapes"),
         ("model", "", "unknown model"),
         ("model", "nosuch.safetensors", "nosuch.safetensors"),
-        ("model", 7, "model must be a name or a path, not a int"),
+        ("model", 7, "model must be a name or a path, not of the type int"),
         ("max_angle", 0, "max_angle"),
         ("max_angle", -5.0, "max_angle"),
         ("max_angle", 181, "max_angle"),

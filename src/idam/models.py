@@ -91,4 +91,4 @@ def _text(model: Any) -> str:
     try:
         return str(os.fspath(model))
     except TypeError:
-        raise InputError(f"model must be a name or a path, not a {type(model).__name__}") from None
+        raise InputError(f"model must be a name or a path, not of the type {type(model).__name__}") from None

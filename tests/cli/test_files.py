@@ -124,6 +124,17 @@ def test_info_of_a_cloud(work: Path, call: Call) -> None:
     assert "left out 1 points that are NaN or infinite" in out
 
 
+def test_register_and_view_say_what_a_file_leaves_out(work: Path, call: Call) -> None:
+    points = np.concatenate([shape(), np.full((7, 3), np.nan)])
+    np.save("camera.npy", points)
+    words = "idam: camera.npy: left out 7 points that are NaN or infinite\n"
+    code, out, err = call("register", "camera.npy", "target.xyz", "--refine", "none")
+    assert (code, err) == (0, words)
+    assert np.isfinite(np.loadtxt(out.splitlines()[:4])).all()
+    assert call("register", "camera.npy", "target.xyz", "--refine", "none", "-q").err == ""
+    assert call("view", "camera.npy", "target.xyz", "--no-open").err == words
+
+
 def test_info_of_meshes_scans_and_transforms(work: Path, call: Call) -> None:
     Path("a.off").write_text("OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n")
     assert "mesh        2 triangles" in call("info", "a.off").out

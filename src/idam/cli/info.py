@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from idam.cli.shared import left_out
 
 if TYPE_CHECKING:
     from idam.io import PointCloud, Scan
@@ -116,20 +115,3 @@ def unit(low: Array, high: Array) -> str:
 def line(name: str, value: str) -> None:
     """Print a figure under its name."""
     print(f"{name:<12}{value}")
-
-
-@contextmanager
-def left_out() -> Iterator[list[str]]:
-    """What readers say that they left out."""
-    remarks: list[str] = []
-    handler = logging.Handler()
-    handler.emit = lambda record: remarks.append(record.getMessage())  # type: ignore[method-assign]
-    log = logging.getLogger("idam.io")
-    level = log.level
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        yield remarks
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(level)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import typer
+
 __all__ = ["models"]
 
 USES = {
@@ -13,7 +17,11 @@ USES = {
 """What to choose a model for; all others are for the paper's experiments."""
 
 
-def models() -> None:
+def models(
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Print the commands that trained them, too.")
+    ] = False,
+) -> None:
     """List the shipped models: what each is for, what it was trained on, and its validation errors."""
     from idam.weights import DEFAULT, list_models, provenance
 
@@ -30,7 +38,8 @@ def models() -> None:
             f"commit {history.get('commit') or 'unknown'}"
         )
         print(f"  {as_told(history.get('validation', {}))}")
-        print(f"  {history.get('command', '')}")
+        if verbose:
+            print(f"  {history.get('command', '')}")
     print("RMSE and MAE in degrees, network alone; accuracy: share of points whose best match is right.")
     print("All on shapes held out of the training.")
     print("Names that begin with gnn or fpfh are networks of the paper and need PyTorch: pip install 'idam[torch]'.")

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from idam.cli.shared import UNSURE, show
+from idam.cli.shared import UNSURE, read, show
 from idam.errors import InputError
 
 __all__ = ["register"]
@@ -81,7 +81,8 @@ def register(
     if save_plot is not None:
         check_drawable(save_plot)
     with steps_told(verbose), faults_named(source, target):
-        source_cloud, target_cloud = read_point_cloud(source), read_point_cloud(target)
+        reader = read_point_cloud if quiet or verbose else read  # the steps tell what it leaves out, too
+        source_cloud, target_cloud = reader(source), reader(target)
         result = registration.register(
             source_cloud,
             target_cloud,

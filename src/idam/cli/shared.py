@@ -2,21 +2,53 @@
 
 from __future__ import annotations
 
+import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from idam.io import PointCloud
     from idam.result import RegistrationResult
 
-__all__ = ["BAD_INPUT", "UNSURE", "Data", "show", "tell"]
+__all__ = ["BAD_INPUT", "UNSURE", "Data", "left_out", "read", "show", "tell"]
 
 UNSURE = 1
 BAD_INPUT = 2
 
 Data = Annotated[Path, typer.Option("--data", help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")]
+
+
+def read(path: Path) -> PointCloud:
+    """Read a cloud, and say on stderr what of the file is left out."""
+    from idam.io import read_point_cloud
+
+    with left_out() as remarks:
+        cloud = read_point_cloud(path)
+    for remark in remarks:
+        print(f"idam: {path}: {remark.removeprefix(f'{path}: ')}", file=sys.stderr)
+    return cloud
+
+
+@contextmanager
+def left_out() -> Iterator[list[str]]:
+    """What readers say that they left out."""
+    remarks: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: remarks.append(record.getMessage())  # type: ignore[method-assign]
+    log = logging.getLogger("idam.io")
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield remarks
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
 
 
 def show(result: RegistrationResult, quiet: bool = False) -> None:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from idam.cli.shared import read
+
 __all__ = ["view"]
 
 
@@ -30,13 +32,13 @@ def view(
     """
     import numpy as np
 
-    from idam.io import check_outputs, read_point_cloud, read_transform
+    from idam.io import check_outputs, read_transform
     from idam.report.page import write_view
     from idam.report.record import Record
 
     check_outputs([output], [path for path in (source, target, transform) if path is not None])
     matrix = np.eye(4) if transform is None else read_transform(transform)
-    clouds = read_point_cloud(source), read_point_cloud(target)
+    clouds = read(source), read(target)
     record = Record.of(source, target, unit=unit, options={"transform": transform})
     write_view(output, *clouds, matrix, source_name=source.name, target_name=target.name, record=record)
     print(f"look at {output}")

@@ -28,7 +28,10 @@ def check_points(points: Array, name: str) -> tuple[Array, float]:
         raise InputError(f"{name}: has {len(points)} points, at least {MIN_POINTS} are needed; give a denser scan")
     if not np.abs(points).max() < LARGEST:  # also false for NaN
         count = int((~(np.abs(points) < LARGEST).all(1)).sum())
-        raise InputError(f"{name}: {count} of {len(points)} points are NaN or infinite; remove them first")
+        raise InputError(
+            f"{name}: {count} of {len(points)} points are NaN or infinite; leave them out, as in "
+            "cloud[numpy.isfinite(cloud).all(axis=1)]"
+        )
     centre, radius = core(points)
     # below the rounding of the coordinates themselves, differences mean nothing
     if radius <= 1e-12 * max(1.0, float(np.abs(centre).max())):

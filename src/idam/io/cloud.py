@@ -132,5 +132,6 @@ def float_rows(data: Any, name: str) -> NDArray[np.float64]:
         raise InputError(f"{name}: expected (N, 3) real numbers, got {array.dtype} of shape {array.shape}")
     if array.ndim != 2 or array.shape[1] != 3:
         hint = ": transpose it" if array.ndim == 2 and array.shape[0] in (3, 4) else ""
+        hint = ": give cloud.reshape(-1, 3)" if array.ndim == 3 and array.shape[2] == 3 else hint
         raise InputError(f"{name}: expected (N, 3), got shape {array.shape}{hint}")
     return array.astype(np.float64, copy=False)
