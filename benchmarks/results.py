@@ -255,6 +255,31 @@ def trust(record: dict[str, Any]) -> str:
     return "\n".join(["## Trust", "", picture, "", families(record["families"]), "", about])
 
 
+def precision(record: dict[str, Any]) -> str:
+    """How well the covariance tells the error, by shape, points and noise."""
+    rows = record["rows"]
+    noises = sorted({row["noise"] for row in rows if row["noise"] is not None})
+    lines = [line(["shape", "points", *(f"noise {noise:g}" for noise in noises)]), line(["---"] * (2 + len(noises)))]
+    groups: dict[tuple[str, int], list[str]] = {}
+    for row in rows:
+        if row["points"] is not None:
+            groups.setdefault((row["shape"], row["points"]), []).append(nees(row["nees"]))
+    lines += [line([shape, f"{points:,}", *cells]) for (shape, points), cells in groups.items()]
+    loops = [f"{row['shape']}: {nees(row['nees'])}, {len(row['nees'])} loops. " for row in rows if row["noise"] is None]
+    about = (
+        f"- `benchmarks/precision.py`: {record['date'][:10]}, {record['processor']}. Mean (median) NEES of "
+        f"{len(rows[0]['nees'])} registrations each; 6 is right. Noise is the standard deviation of each coordinate of "
+        f"shapes about as large as the unit sphere. {''.join(loops)}"
+    )
+    return "\n".join(["## Precision", "", *lines, "", about.rstrip()])
+
+
+def nees(found: list[float | None]) -> str:
+    """Mean and median of those that are right."""
+    right = [x for x in found if x is not None]
+    return f"{statistics.mean(right):.1f} ({statistics.median(right):.1f})"
+
+
 def families(rows: dict[str, dict[str, float]]) -> str:
     """A table with a line a family."""
     columns = list(next(iter(rows.values())))
@@ -284,6 +309,7 @@ def main() -> None:
     sections += [scale(content) for content in files if isinstance(content, list)]
     sections += [real_scans(record) for record in records if "overlap" in record.get("records", [{}])[0]]
     sections += [merged(record) for record in records if "errors" in record.get("records", [{}])[0]]
+    sections += [precision(record) for record in records if "nees" in record.get("rows", [{}])[0]]
     sections += [trust(record) for record in records if "families" in record]
     sections += [confidences(record) for record in records if "left out" in record]
     print("\n\n".join(sections))

@@ -142,16 +142,24 @@ def follow(ledger: Ledger, rows: Iterable[Row], total: int) -> None:
     columns = (
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:.1f} pairs/s, {task.fields[failed]} failed, confidence {task.fields[mean]:.2f}"),
+        TextColumn("{task.fields[told]}"),
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("", total=total, rate=0.0, failed=0, mean=0.0)
+        task = progress.add_task("", total=total, told="")
         failed, confidence = 0, 0.0
         for done, row in enumerate(rows, 1):
             ledger.append(row)
             failed += row["status"] == "failed"
             confidence += row["confidence"] or 0.0
-            speed = progress.tasks[task].speed or 0.0
-            progress.update(task, advance=1, rate=speed, failed=failed, mean=confidence / max(1, done - failed))
+            mean = confidence / max(1, done - failed)
+            told = f"{pace(progress.tasks[task].speed)}{failed} failed, mean confidence {mean:.0%}"
+            progress.update(task, advance=1, told=told)
+
+
+def pace(speed: float | None) -> str:
+    """Say how fast pairs are done, given pairs a second, in three digits: ``12.5 pairs/s, `` or ``3.08 s a pair, ``."""
+    if not speed:
+        return ""
+    return f"{speed:.3g} pairs/s, " if speed >= 1 else f"{1 / speed:.3g} s a pair, "

@@ -19,7 +19,7 @@ USES = {
 
 def models(
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Print the commands that trained them, too.")
+        bool, typer.Option("--verbose", "-v", help="Also print the commands that trained them.")
     ] = False,
 ) -> None:
     """List the shipped models: what each is for, what it was trained on, and its validation errors."""
