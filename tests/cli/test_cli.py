@@ -401,6 +401,24 @@ def test_refuses_in_a_process_of_its_own(work: Path, file: str) -> None:
     assert files_in(work) == before
 
 
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["train", "unseen-shapes", "--data", "x"],
+        ["evaluate", "--pairs", "x.npz"],
+        ["figures", "x", "--data", "x"],
+        ["data", "modelnet40", "x"],
+    ],
+)
+def test_the_core_alone_names_what_the_lab_needs(args: list[str]) -> None:
+    names = "torch", "scipy", "h5py", "lightning_fabric", "tensorboard", "matplotlib"
+    code = f"import sys; sys.modules.update(dict.fromkeys({names})); from idam import cli; cli.main()"
+    run = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert "pip install 'idam[lab]'" in run.stderr
+    assert run.stderr.count("\n") == 1
+
+
 def test_interruption_leaves_no_traceback(work: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt

@@ -29,6 +29,9 @@ __all__ = ["main"]
 BROKEN_PIPE = 141
 """What shells make of a program whose reader has gone, as ``| head`` does."""
 
+LAB = ("torch", "scipy", "h5py", "lightning_fabric", "tensorboard", "matplotlib")
+"""Packages that the core does without, and training, evaluation and figures need."""
+
 app = typer.Typer(
     name="idam",
     help="Learned global registration of partially overlapping 3D point clouds.",
@@ -46,6 +49,10 @@ def main() -> NoReturn:
         sys.stdout.flush()
     except (InputError, MissingDependencyError) as error:
         stop(str(error), BAD_INPUT)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] not in LAB:
+            raise
+        stop(f"this needs {error.name}, of the packages for the lab: pip install 'idam[lab]'", BAD_INPUT)
     except (KeyboardInterrupt, typer.Abort):
         stop("interrupted", 130)
     except SystemExit as stopped:  # which the parser makes of a reader that has gone, with the code of an unsure answer
