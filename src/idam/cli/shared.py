@@ -74,6 +74,7 @@ def show(result: RegistrationResult, quiet: bool = False) -> None:
         print(f"reason      {result.reason}")
     if result.remark:
         print(f"remark      {result.remark}")
+    print(f"model       {result.model}")
     print(f"time        {result.seconds:.2f} s")
 
 
