@@ -265,11 +265,12 @@ def precision(record: dict[str, Any]) -> str:
         if row["points"] is not None:
             groups.setdefault((row["shape"], row["points"]), []).append(nees(row["nees"]))
     lines += [line([shape, f"{points:,}", *cells]) for (shape, points), cells in groups.items()]
-    loops = [f"{row['shape']}: {nees(row['nees'])}, {len(row['nees'])} loops. " for row in rows if row["noise"] is None]
+    loops = [row for row in rows if row["noise"] is None]
+    told = [f"{row['shape'].capitalize()}: {nees(row['nees'])}, {len(row['nees'])} loops. " for row in loops]
     about = (
         f"- `benchmarks/precision.py`: {record['date'][:10]}, {record['processor']}. Mean (median) NEES of "
         f"{len(rows[0]['nees'])} registrations each; 6 is right. Noise is the standard deviation of each coordinate of "
-        f"shapes about as large as the unit sphere. {''.join(loops)}"
+        f"shapes about as large as the unit sphere. {''.join(told)}"
     )
     return "\n".join(["## Precision", "", *lines, "", about.rstrip()])
 
