@@ -249,8 +249,8 @@ def trust(record: dict[str, Any]) -> str:
         "a sure answer to one of the others counts as wrong."
     )
     picture = (
-        "![Risk against coverage](images/risk.png)\n\nOf the pairs, the surest first, the share that is wrong; the dots "
-        "are at a confidence of 0.9."
+        "![Risk against coverage](images/risk.png)\n\nOf the pairs, the surest first, the share that is wrong; the "
+        "dots are at a confidence of 0.9."
     )
     return "\n".join(["## Trust", "", picture, "", families(record["families"]), "", about])
 
