@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -54,6 +53,7 @@ def merge(
     from idam.io import check_writable, make_folder
     from idam.many.files import KEPT, read_poses, write_merge
     from idam.many.merge import merge as run
+    from idam.processes import cores
     from idam.report.merge import write_merge_report
 
     check_apart(scans, output)
@@ -89,12 +89,6 @@ def check_apart(scans: list[Path], output: Path) -> None:
             raise InputError(
                 f"{output}: holds scans to merge: write to a folder of its own, such as {output / 'merged'}"
             )
-
-
-def cores() -> int:
-    """How many processes may run at once."""
-    allowed = getattr(os, "sched_getaffinity", None)  # not on macOS and Windows
-    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def show(result: MergeResult, output: Path) -> None:
