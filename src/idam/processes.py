@@ -25,6 +25,8 @@ TRIES = 2
 """Times that a task is begun: its process may have died of something else, the second one hardly."""
 STARTS = 5
 """Processes in a row that may die before they are ready, until it is the program that is at fault."""
+HERE = "here"
+"""What a process says first."""
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1")
 """One thread a process: the processes are what fills the cores."""
 
@@ -78,11 +80,14 @@ class Worker(Generic[Task]):
             return self._bury()
         if message is None:
             return self._expire() if late else None
-        if not self._ready:
+        if self._ready:
+            return self._done(message)
+        if message == HERE:
+            self._tell(self._build)
+        else:
             self._ready, self._starts = True, 0
             self._send()
-            return None
-        return self._done(message)
+        return None
 
     @staticmethod
     def wait(workers: Sequence[Worker[Any]]) -> None:
@@ -100,7 +105,8 @@ class Worker(Generic[Task]):
     def _start(self) -> None:
         context = get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._build), daemon=True)
+        # what it works with is sent once it reads: of a process that dies before, nobody would empty the pipe
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
         with _one_thread(), _no_interrupt():
             self._process.start()
         theirs.close()
@@ -114,8 +120,11 @@ class Worker(Generic[Task]):
         self._tries += 1
         self._begun = time.monotonic()
         self._deadline = self._begun + self._limit
+        self._tell(self._task)
+
+    def _tell(self, what: Any) -> None:
         with contextlib.suppress(OSError):  # it has died: there is an end of file to read
-            self._connection.send(self._task)
+            self._connection.send(what)
 
     def _done(self, row: Row) -> Row:
         self._task, self._deadline = None, math.inf
@@ -148,12 +157,13 @@ class Worker(Generic[Task]):
         return self._failed(f"took longer than the limit of {self._limit:g} s")
 
 
-def _serve(connection: Connection, build: Callable[[], Callable[[Any], Row]]) -> None:
+def _serve(connection: Connection) -> None:
     """Make the row of every task that comes, until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal: the first one decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    work = build()
     with contextlib.suppress(EOFError, OSError):
+        connection.send(HERE)
+        work = connection.recv()()
         connection.send("ready")
         while True:
             connection.send(work(connection.recv()))

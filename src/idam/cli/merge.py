@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from idam.cli.shared import UNSURE
+from idam.cli.shared import INTERRUPTED, UNSURE
 from idam.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,19 +60,23 @@ def merge(
     starting = None if poses is None else read_poses(poses)
     make_folder(output)
     check_writable(output / "merged.ply")
-    with progress_shown(quiet) as progress:
-        result = run(
-            scans,
-            reference=reference,
-            voxel_size=voxel_size,
-            partners=partners,
-            jobs=cores() if jobs is None else jobs,
-            threshold=threshold,
-            poses=starting,
-            strict=strict,
-            keep=output / KEPT,
-            progress=progress,
-        )
+    try:
+        with progress_shown(quiet) as progress:
+            result = run(
+                scans,
+                reference=reference,
+                voxel_size=voxel_size,
+                partners=partners,
+                jobs=cores() if jobs is None else jobs,
+                threshold=threshold,
+                poses=starting,
+                strict=strict,
+                keep=output / KEPT,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        print("idam: interrupted: run the same command to go on", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
     write_merge(output, result, cloud=not no_cloud)
     write_merge_report(output / "report.html", result)
     if not quiet:

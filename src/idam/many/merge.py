@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from idam.many.pairs import Kept, Pair, Row, Workers, register_pairs
 from idam.many.partners import likeliness
 from idam.many.posed import Posed, pose
 from idam.many.result import MergeResult
-from idam.many.scans import Scan, described, read_scans, thinned
+from idam.many.scans import Scan, described, read_scans, spacing, thinned
 from idam.many.suggested import Suggested
 from idam.registration import as_rigid, check_options
 from idam.rigid import Array
@@ -101,12 +102,11 @@ def merge(
     refined = joint.refine(posed.poses, surfaces, posed.trust.components)
     if posed.contradicts(refined):
         refined = posed.poses
-    spacing = frame.unit * max(surface.spacing for surface in surfaces)
-    return collect(names, read, posed, frame.leave(refined, posed.trust.components), spacing, started)
+    return collect(names, read, posed, frame.leave(refined, posed.trust.components), spacing(some), started)
 
 
 def collect(
-    names: list[str], read: list[Scan | str], posed: Posed, poses: Array, spacing: float, started: float
+    names: list[str], read: list[Scan | str], posed: Posed, poses: Array, apart: float, started: float
 ) -> MergeResult:
     """The result for all scans given, from that for those that could be read."""
     number = [i for i, scan in enumerate(read) if isinstance(scan, Scan)]
@@ -126,7 +126,7 @@ def collect(
         confidence=confidence,
         reason=reason,
         links=[link.numbered(number) for link in posed.links],
-        spacing=spacing,
+        spacing=apart,
         seconds=time.perf_counter() - started,
         clouds=[scan.cloud if isinstance(scan, Scan) else None for scan in read],
     )
@@ -148,12 +148,26 @@ def find(reference: str | int | None, names: list[str], scans: list[Scan]) -> in
     if isinstance(reference, Integral):
         if not 0 <= int(reference) < len(names):
             raise InputError(f"reference {reference}: there are scans 0 to {len(names) - 1}")
-        reference = names[int(reference)]
-    place = next((i for i, scan in enumerate(scans) if scan.name == reference), None)
+        meant = [names[int(reference)]]
+    else:
+        meant = [reference] if reference in names else [name for name in names if may_mean(str(reference), name)]
+    if len(meant) != 1:
+        fault = f"may be {' or '.join(meant[:3])}" if meant else "is not among the scans"
+        raise InputError(f"reference {reference!r} {fault}: name one of {', '.join(meant or names[:3])}")
+    place = next((i for i, scan in enumerate(scans) if scan.name == meant[0]), None)
     if place is None:
-        what = "cannot be used" if reference in names else "is not among the scans"
-        raise InputError(f"reference {reference!r} {what}: name one of {', '.join(names[:3])} ...")
+        raise InputError(f"reference {reference!r} cannot be used: name another scan, such as {scans[0].name}")
     return place
+
+
+def may_mean(reference: str, name: str) -> bool:
+    """Whether a reference may mean the scan of a name: it is its path, or its name without folders or extension."""
+    given = Path(reference).parts
+    for own in (Path(name).parts, Path(name).with_suffix("").parts):
+        length = min(len(own), len(given))
+        if length and own[-length:] == given[-length:]:
+            return True
+    return False
 
 
 def starting_poses(poses: Mapping[str, ArrayLike] | None, scans: list[Scan]) -> dict[int, Array]:
@@ -163,6 +177,11 @@ def starting_poses(poses: Mapping[str, ArrayLike] | None, scans: list[Scan]) -> 
     """
     if poses is not None:
         places = {scan.name: place for place, scan in enumerate(scans)}
+        if poses and not places.keys() & poses.keys():
+            raise InputError(
+                f"the starting poses are of none of the scans: of {', '.join(list(poses)[:3])}, where the scans are "
+                f"{', '.join(list(places)[:3])}"
+            )
         return {places[name]: as_rigid(matrix) for name, matrix in poses.items() if name in places}
     brought = {
         place: scan.pose for place, scan in enumerate(scans) if scan.pose is not None and not rigid_fault(scan.pose)

@@ -15,16 +15,20 @@ from numpy.typing import NDArray
 
 from idam import io, rigid
 from idam.clouds.prepared import SMALL, Prepared
+from idam.clouds.surfaces import spacing_of
 from idam.errors import InputError, MissingDependencyError
 from idam.io import PointCloud, as_point_cloud, is_readable
+from idam.io.files import check_source
 from idam.models import resolve
 from idam.registration import prepared
 from idam.rigid import Array
 
-__all__ = ["Scan", "Thinned", "described", "read_scans", "thinned"]
+__all__ = ["Scan", "Thinned", "described", "read_scans", "spacing", "thinned"]
 
 THINNED = 5000
 """Points of a scan at most that the joint refinement uses."""
+SOME = 10
+"""Scans at most that tell the spacing of all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +93,12 @@ def _thinned(prepared: Prepared, voxel_size: float, unit: float) -> Thinned:
     return Thinned(points, normals, surface.tree, level.spacing / unit, faces)
 
 
+def spacing(scans: Sequence[Scan]) -> float:
+    """The median distance of neighbouring points of the scans, of some of these, in input units."""
+    some = scans[:: len(scans) // SOME + 1]
+    return float(np.median([spacing_of(scan.prepared.base) for scan in some]))
+
+
 def described(scans: Sequence[Scan]) -> tuple[list[Array], list[NDArray[np.float32]], float]:
     """Points (N, 3) and features (N, K) of all scans on one grid, and the spacing of the points."""
     descriptor = resolve("default").descriptor
@@ -137,22 +147,41 @@ def read_scans(scans: Iterable[Any], strict: bool = False) -> tuple[list[str], l
 def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple[str, Any, Array | None]]]]]:
     """What each entry is called, and how its scans are read, each with its name and pose.
 
-    A file is called by its name without the folder, anything else by its number; a folder stands for the files in it.
+    A folder stands for the files in it. A file is called by its name, with as many of its folders as tell it from other
+    files of that name; anything else by its number.
     """
-    if isinstance(scans, (str, os.PathLike)):
-        scans = [scans]
-    for number, data in enumerate(scans):
+    entries: list[Any] = []
+    for data in [scans] if isinstance(scans, (str, os.PathLike)) else scans:
         if isinstance(data, (str, os.PathLike)):
-            for file in clouds_in(Path(data)) if Path(data).is_dir() else [Path(data)]:
-                yield file.name, partial(scans_of, file)
+            entries += clouds_in(Path(data)) if Path(data).is_dir() else [Path(data)]
+        else:
+            entries.append(data)
+    names = iter(told_apart([entry for entry in entries if isinstance(entry, Path)]))
+    for number, data in enumerate(entries):
+        if isinstance(data, Path):
+            name = next(names)
+            yield name, partial(scans_of, data, name)
         else:
             name = f"scan{number:03d}"
             yield name, partial(list, [(name, data, None)])
 
 
-def scans_of(file: Path) -> list[tuple[str, Any, Array | None]]:
+def told_apart(files: Sequence[Path]) -> list[str]:
+    """The shortest ends of files' paths that tell them apart; one that is given twice has the same name twice."""
+    paths = [(file.parent.resolve() / file.name).parts for file in files]
+    names = []
+    for own in paths:
+        length = 1
+        while any(other[-length:] == own[-length:] and other != own for other in paths):
+            length += 1
+        names.append("/".join(own[-length:]))
+    return names
+
+
+def scans_of(file: Path, name: str) -> list[tuple[str, Any, Array | None]]:
     """The scans of a file, with their names and poses."""
-    return [(scan.name, scan.cloud, scan.pose) for scan in io.read_scans(file)]
+    check_source(file)
+    return [(name + scan.name.removeprefix(file.name), scan.cloud, scan.pose) for scan in io.read_scans(file)]
 
 
 def ready(name: str, data: Any, pose: Array | None) -> Scan:
