@@ -19,6 +19,7 @@ from idam.clouds.surfaces import spacing_of
 from idam.errors import InputError, MissingDependencyError
 from idam.io import PointCloud, as_point_cloud, is_readable
 from idam.io.files import check_source
+from idam.many.names import told_apart
 from idam.models import resolve
 from idam.registration import prepared
 from idam.rigid import Array
@@ -164,18 +165,6 @@ def sources(scans: Iterable[Any]) -> Iterator[tuple[str, Callable[[], list[tuple
         else:
             name = f"scan{number:03d}"
             yield name, partial(list, [(name, data, None)])
-
-
-def told_apart(files: Sequence[Path]) -> list[str]:
-    """The shortest ends of files' paths that tell them apart; one that is given twice has the same name twice."""
-    paths = [(file.parent.resolve() / file.name).parts for file in files]
-    names = []
-    for own in paths:
-        length = 1
-        while any(other[-length:] == own[-length:] and other != own for other in paths):
-            length += 1
-        names.append("/".join(own[-length:]))
-    return names
 
 
 def scans_of(file: Path, name: str) -> list[tuple[str, Any, Array | None]]:
