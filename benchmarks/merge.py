@@ -100,7 +100,7 @@ def summary(
     worst = [max(each[axis] for each in placed) for axis in (0, 1)]
     print(
         f"{name:<40} placed {len(placed)} of {len(off)}, right {good}, worst {worst[0]:.3f} degrees and "
-        f"{worst[1]:.3g}, median {np.median([each[0] for each in placed]):.3f} degrees, {seconds:.1f} s",
+        f"{worst[1]:.3g}, median {np.median([each[0] for each in placed]):.3f} degrees, {seconds:.1f} s of CPU time",
         flush=True,
     )
     return {"method": name, "errors": off, "right": good, "seconds": seconds}
@@ -182,9 +182,9 @@ def open3d_graph(
 
 
 def timed(work: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, float]:
-    """What a call returns, and the seconds it took."""
-    started = time.perf_counter()
-    return work(*args, **options), time.perf_counter() - started
+    """What a call returns, and the seconds of CPU time that this process and those it ended took."""
+    before = sum(os.times()[:4])
+    return work(*args, **options), sum(os.times()[:4]) - before
 
 
 def objects(folders: list[Path], voxel: float, jobs: int) -> list[dict[str, Any]]:
@@ -285,12 +285,12 @@ def merged(
     name: str, site: Site, given: argparse.Namespace, right: tuple[float, float], partners: int | None = None
 ) -> dict[str, Any]:
     """What a table says of a merge; each component's poses are compared with the truth from its own first scan."""
-    before = os.times()
+    started = time.perf_counter()
     kept = given.keep and given.keep / f"{name}.jsonl"
     gone_on = bool(kept and kept.exists())
     with Memory() as memory:
-        result, seconds = timed(idam.merge, site.scans, jobs=given.jobs, partners=partners, keep=kept)
-    cpu = sum(os.times()[:4]) - sum(before[:4])
+        result, cpu = timed(idam.merge, site.scans, jobs=given.jobs, partners=partners, keep=kept)
+    seconds = time.perf_counter() - started
     good = np.zeros(len(site.scans), bool)
     for scans in result.components:
         inside = set(scans)

@@ -228,7 +228,7 @@ def confidences(record: dict[str, Any]) -> str:
 
 def many(parts: dict[str, Any]) -> str:
     """Where merging many scans puts them: next to Open3D's multiway registration, on ray-cast scans, by confidence."""
-    lines = [line(["scans", "method", "right", "worst", "median", "seconds"]), line(["---"] * 6)]
+    lines = [line(["scans", "method", "right", "worst", "median", "CPU s"]), line(["---"] * 6)]
     for row in parts["objects"]["records"]:
         degrees, shift = ([error[n] for error in row["errors"]] for n in (0, 1))
         worst = f"{max(degrees):.2f} degrees, {1000 * max(shift):.2f} mm"
@@ -244,7 +244,7 @@ def many(parts: dict[str, Any]) -> str:
     commands = "; ".join(f"`{parts[part]['command']}`, {parts[part]['date'][:10]}" for part in sites)
     explained = (
         f"- Ray-cast scans: {commands}. Right is relative to the first scan of the component. CPU time of all "
-        "processes; memory is the most that all have together."
+        "processes; memory is the most that all have together; there are none where pairs were kept from another run."
     )
     by_confidence = [
         line([f"{low:.2f} to {high:.2f}", f"{row['scans']}", f"{row['said']:.3f}", f"{row['right']:.3f}"])
