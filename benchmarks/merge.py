@@ -20,7 +20,7 @@ furnished rooms. ``growth``: the same with fewer points and 4 partners, by the n
 without registering: scans that overlap by 20 % get the truth with some noise, others anything with little confidence,
 which leaves all else that a merge does. Time is CPU time of all processes, memory the most that they have together.
 ``trust``: how often poses are right by their confidence, in made-up graphs whose links are wrong once, one and a half
-times and twice as often as their confidence says. ``plot``: draws the growth, and how often poses are right by their
+times and twice as often as their confidence says. ``plot``: draws ``pairs``, and how often poses are right by their
 confidence.
 """
 
@@ -385,14 +385,14 @@ def plot(results: Path, images: Path) -> None:
     """Draw growth and trust."""
     pyplot = import_module("matplotlib.pyplot")
     parts = json.loads(results.read_text())
-    figure, axes = pyplot.subplots(1, 3, figsize=(11, 3.4), layout="constrained")
-    for place, part, key, label in (
-        (axes[0], "growth", "pairs", "pairs registered"),
-        (axes[1], "growth", "cpu", "CPU time (s)"),
-        (axes[2], "pairs", "cpu", "CPU time without registering (s)"),
+    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    records = parts["pairs"]["records"]
+    scans = [record["scans"] for record in records]
+    for place, key, label in (
+        (axes[0], "pairs", "pairs registered"),
+        (axes[1], "cpu", "CPU time without registering (s)"),
     ):
-        records = parts[part]["records"]
-        scans, values = [record["scans"] for record in records], [record[key] for record in records]
+        values = [record[key] for record in records]
         place.plot(scans, values, "o-", color="#1f6f8b")
         slope = np.dot(scans, values) / np.dot(scans, scans)
         place.plot([0, scans[-1]], [0, slope * scans[-1]], ":", color="#888888", label=f"{slope:.2g} a scan")
