@@ -1,23 +1,27 @@
 """Merging many scans: ``idam.merge`` next to Open3D's multiway registration, its growth, its trust.
 
-    python benchmarks/merge.py objects FOLDER... [--voxel-size SIZE] [--json FILE]
-    python benchmarks/merge.py views MESH... [--scans 15] [--step 24] [--points 20000] [--json FILE]
-    python benchmarks/merge.py rooms [--scans 60] [--points 50000] [--jobs 2] [--json FILE]
-    python benchmarks/merge.py growth [--scans 10 25 50 100 200] [--points 3000] [--json FILE]
-    python benchmarks/merge.py pairs [--scans 10 25 50 100 200] [--points 3000] [--json FILE]
-    python benchmarks/merge.py trust [--graphs 40] [--json FILE]
-    python benchmarks/merge.py plot docs/results docs/images
+    python benchmarks/merge.py objects FOLDER... [--voxel-size SIZE]
+    python benchmarks/merge.py views MESH... [--scans 15] [--step 24] [--points 20000] [--noise 0.002] [--poles]
+    python benchmarks/merge.py rooms [--scans 60] [--points 50000] [--jobs 2]
+    python benchmarks/merge.py growth [--scans 10 25 50 100 200] [--points 3000]
+    python benchmarks/merge.py pairs [--scans 10 25 50 100 200] [--points 3000]
+    python benchmarks/merge.py trust [--graphs 40]
+    python benchmarks/merge.py plot docs/results/merge.json docs/images
+
+Each but the last takes ``--json FILE``, where its part of the file is written anew, and ``--keep FOLDER``, where
+registered pairs are kept for a run that is stopped; the time of one that goes on is not its own.
 
 ``objects``: folders of scans with a ``pairs.json``, whose pairs compose to the true poses. Each scan is turned at
 random first. Open3D gets the pairs by FPFH, RANSAC and point-to-plane ICP with its voxel size set by hand, and idam's
 own links too; its graph starts from the spanning tree of the best fitness, every edge is uncertain (its line process),
-and its settings are those of its tutorial. ``views``: one-sided views of meshes from all around, ray-cast. ``rooms``:
-ray-cast scans from a terrestrial scanner's way through furnished rooms. ``growth``: the same with fewer points and 4
-partners, by the number of scans. ``pairs``: the same without registering: scans that overlap by 30 % get the truth with
-some noise, others anything with little confidence, which leaves all else that a merge does. Time is CPU time of all
-processes, memory the most that they have together. ``trust``: how often poses are right by their confidence, in made-up
-graphs whose links are wrong once, one and a half times and twice as often as their confidence says.
-``plot``: draws ``merge-pairs.json`` and ``merge-trust.json``.
+and its settings are those of its tutorial. ``views``: one-sided views of meshes from all around, ray-cast; with
+``--poles`` one from above and one from below, too. ``rooms``: ray-cast scans from a terrestrial scanner's way through
+furnished rooms. ``growth``: the same with fewer points and 4 partners, by the number of scans. ``pairs``: the same
+without registering: scans that overlap by 20 % get the truth with some noise, others anything with little confidence,
+which leaves all else that a merge does. Time is CPU time of all processes, memory the most that they have together.
+``trust``: how often poses are right by their confidence, in made-up graphs whose links are wrong once, one and a half
+times and twice as often as their confidence says. ``plot``: draws ``pairs``, and how often poses are right by their
+confidence.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 from unittest import mock
+from zlib import crc32
 
 import numpy as np
 
@@ -95,7 +100,7 @@ def summary(
     worst = [max(each[axis] for each in placed) for axis in (0, 1)]
     print(
         f"{name:<40} placed {len(placed)} of {len(off)}, right {good}, worst {worst[0]:.3f} degrees and "
-        f"{worst[1]:.3g}, median {np.median([each[0] for each in placed]):.3f} degrees, {seconds:.1f} s",
+        f"{worst[1]:.3g}, median {np.median([each[0] for each in placed]):.3f} degrees, {seconds:.1f} s of CPU time",
         flush=True,
     )
     return {"method": name, "errors": off, "right": good, "seconds": seconds}
@@ -177,9 +182,9 @@ def open3d_graph(
 
 
 def timed(work: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, float]:
-    """What a call returns, and the seconds it took."""
-    started = time.perf_counter()
-    return work(*args, **options), time.perf_counter() - started
+    """What a call returns, and the seconds of CPU time that this process and those it ended took."""
+    before = sum(os.times()[:4])
+    return work(*args, **options), sum(os.times()[:4]) - before
 
 
 def objects(folders: list[Path], voxel: float, jobs: int) -> list[dict[str, Any]]:
@@ -211,34 +216,39 @@ def objects(folders: list[Path], voxel: float, jobs: int) -> list[dict[str, Any]
 # Ray-cast scans
 
 
-def views(meshes: list[Path], count: int, step: float, points: int, jobs: int) -> list[dict[str, Any]]:
+def views(given: argparse.Namespace) -> list[dict[str, Any]]:
     """Objects seen from places around their longest axis, so many degrees apart."""
     trimesh = import_module("trimesh")
     records = []
-    for path in meshes:
-        mesh, rng = trimesh.load(path, process=False), np.random.default_rng(0)
+    count, points = (given.scans or [15])[0], given.points or 20_000
+    for path in given.paths:
+        mesh, rng = trimesh.load(path, process=False), np.random.default_rng(crc32(path.stem.encode()))
         axis = int(np.argmax(np.ptp(mesh.vertices, axis=0)))
-        around = np.radians(step) * np.arange(count)
-        towards = np.insert(np.stack([np.cos(around), np.sin(around)], 1), axis, rng.normal(0.15, 0.05, count), axis=1)
-        site = draw_views(np.asarray(mesh.triangles), towards, points, 0.002, rng)
+        around = np.radians(given.step) * np.arange(count)
+        towards = np.insert(np.stack([np.cos(around), np.sin(around)], 1), axis, rng.normal(0.1, 0.05, count), axis=1)
+        for end in (1.0, -1.0) if given.poles else ():
+            towards = np.concatenate([towards, np.insert(rng.normal(0, 0.4, 2), axis, end)[None]])
+        site = draw_views(np.asarray(mesh.triangles), towards, points, given.noise, rng)
         radius = float(np.median([np.linalg.norm(scan - scan.mean(0), axis=1).max() for scan in site.scans]))
-        records.append(merged(f"{path.stem}, {count} views", site, jobs, (5.0, 0.1 * radius)))
+        records.append(merged(f"{path.stem}, {len(towards)} views", site, given, (5.0, 0.1 * radius)))
     return records
 
 
-def rooms(counts: list[int], points: int, jobs: int, partners: int | None) -> list[dict[str, Any]]:
+def rooms(counts: list[int], points: int, given: argparse.Namespace, partners: int | None) -> list[dict[str, Any]]:
     """A building, by the number of scans."""
     sites = ((count, draw_building(count, points, np.random.default_rng(count))) for count in counts)
-    return [merged(f"{count} scans of {points} points", site, jobs, (2.0, 0.2), partners) for count, site in sites]
+    return [merged(f"{count} scans of {points} points", site, given, (2.0, 0.2), partners) for count, site in sites]
 
 
-def registered_by_truth(counts: list[int], points: int) -> list[dict[str, Any]]:
+def registered_by_truth(counts: list[int], points: int, given: argparse.Namespace) -> list[dict[str, Any]]:
     """Growth of all but the registrations."""
     records = []
+    given.jobs, given.keep = 1, None
     for count in counts:
         site = draw_building(count, points, np.random.default_rng(count))
-        with mock.patch("idam.many.pairs.register_pair", Told(site)):
-            records.append(merged(f"{count} scans, not registered", site, 1, (2.0, 0.2), 4))
+        told = Told(site)
+        with mock.patch("idam.many.pairs.Register", lambda _, told=told: told):
+            records.append(merged(f"{count} scans, not registered", site, given, (2.0, 0.2), 4))
     return records
 
 
@@ -251,18 +261,18 @@ class Told:
         placed = [rigid.apply(pose, scan) for pose, scan in zip(site.poses, site.scans, strict=True)]
         self._points, self._trees = [each[::20] for each in placed], [small_gicp.KdTree(each) for each in placed]
 
-    def __call__(self, pair: tuple[int, int], _: dict[str, Any]) -> dict[str, Any]:
+    def __call__(self, task: tuple[tuple[int, int], dict[str, Any]]) -> dict[str, Any]:
         """A row as of a registered pair."""
-        source, target = pair
-        rng = np.random.default_rng(pair)
+        source, target = task[0]
+        rng = np.random.default_rng(task[0])
         near = self._trees[target].batch_knn_search(self._points[source], 1)[1][:, 0] < 0.25**2
-        right = near.mean() > 0.3
+        right = near.mean() > 0.2
         truth = rigid.inverse(self._poses[target]) @ self._poses[source]
-        off = rigid.exp(rng.normal(scale=0.002 if right else 2.0, size=6))
+        off = rigid.exp(rng.normal(scale=0.0005 if right else 2.0, size=6))
         return {
             "error": "",
             "transformation": (truth @ off).tolist(),
-            "information": (np.eye(6) / 0.002**2).tolist(),
+            "information": (np.eye(6) / 0.0005**2).tolist(),
             "confidence": 0.97 if right else 0.1,
             "reason": "",
             "overlap": float(near.mean()),
@@ -271,12 +281,16 @@ class Told:
         }
 
 
-def merged(name: str, site: Site, jobs: int, right: tuple[float, float], partners: int | None = None) -> dict[str, Any]:
+def merged(
+    name: str, site: Site, given: argparse.Namespace, right: tuple[float, float], partners: int | None = None
+) -> dict[str, Any]:
     """What a table says of a merge; each component's poses are compared with the truth from its own first scan."""
-    before = os.times()
+    started = time.perf_counter()
+    kept = given.keep and given.keep / f"{name}.jsonl"
+    gone_on = bool(kept and kept.exists())
     with Memory() as memory:
-        result, seconds = timed(idam.merge, site.scans, jobs=jobs, partners=partners)
-    cpu = sum(os.times()[:4]) - sum(before[:4])
+        result, cpu = timed(idam.merge, site.scans, jobs=given.jobs, partners=partners, keep=kept)
+    seconds = time.perf_counter() - started
     good = np.zeros(len(site.scans), bool)
     for scans in result.components:
         inside = set(scans)
@@ -295,11 +309,13 @@ def merged(name: str, site: Site, jobs: int, right: tuple[float, float], partner
         "sure_and_wrong": int((sure & ~good).sum()),
         "worst": off.max(0).tolist(),
         "median": np.median(off, axis=0).tolist(),
-        "cpu": cpu,
-        "seconds": seconds,
-        "memory": memory.most / 2**30,
+        "cpu": None if gone_on else cpu,
+        "seconds": None if gone_on else seconds,
+        "memory": None if gone_on else memory.most / 2**30,
+        "confidence": [float(result.confidence[i]) for scans in result.components for i in scans[1:]],
+        "right": [bool(good[i]) for scans in result.components for i in scans[1:]],
     }
-    print(json.dumps(record), flush=True)
+    print(json.dumps({key: value for key, value in record.items() if not isinstance(value, list)}), flush=True)
     return record
 
 
@@ -361,12 +377,17 @@ def judged(graph: MadeGraph) -> list[tuple[float, bool]]:
     return found
 
 
+EDGES = (0.1, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.001)
+"""Of the confidences that are counted together."""
+
+
 def plot(results: Path, images: Path) -> None:
     """Draw growth and trust."""
     pyplot = import_module("matplotlib.pyplot")
-    records = json.loads((results / "merge-pairs.json").read_text())["records"]
-    scans = [record["scans"] for record in records]
+    parts = json.loads(results.read_text())
     figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    records = parts["pairs"]["records"]
+    scans = [record["scans"] for record in records]
     for place, key, label in (
         (axes[0], "pairs", "pairs registered"),
         (axes[1], "cpu", "CPU time without registering (s)"),
@@ -374,23 +395,31 @@ def plot(results: Path, images: Path) -> None:
         values = [record[key] for record in records]
         place.plot(scans, values, "o-", color="#1f6f8b")
         slope = np.dot(scans, values) / np.dot(scans, scans)
-        place.plot([0, scans[-1]], [0, slope * scans[-1]], ":", color="#888888", label=f"{slope:.2f} a scan")
+        place.plot([0, scans[-1]], [0, slope * scans[-1]], ":", color="#888888", label=f"{slope:.2g} a scan")
         place.set(xlabel="scans", ylabel=label, xlim=0, ylim=0)
         place.legend(frameon=False)
     figure.savefig(images / "merge-growth.png", dpi=110)
-    records = json.loads((results / "merge-trust.json").read_text())["records"]
     figure, place = pyplot.subplots(figsize=(4.6, 4), layout="constrained")
-    edges = np.array([0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999, 1.001])
     for trusting, color in ((1.0, "#1f6f8b"), (1.5, "#d08c2f"), (2.0, "#b0413e")):
-        own = [record for record in records if record["trusting"] == trusting]
-        confidence, right = (np.concatenate([record[key] for record in own]) for key in ("confidence", "right"))
-        bins = [(confidence >= low) & (confidence < high) for low, high in pairwise(edges)]
-        said, was = ([values[rows].mean() for rows in bins if rows.sum() > 20] for values in (confidence, right))
+        own = [record for record in parts["trust"]["records"] if record["trusting"] == trusting]
+        bins = [found for *_, found in calibration(own) if found["scans"] > 20]
+        said, was = ([found[key] for found in bins] for key in ("said", "right"))
         place.plot(said, was, "o-", color=color, label=f"links wrong {trusting:g} times as often as they say")
-    place.plot([0.7, 1], [0.7, 1], ":", color="#888888")
+    place.plot([0.5, 1], [0.5, 1], ":", color="#888888")
     place.set(xlabel="confidence of a scan", ylabel="share that is right")
     place.legend(frameon=False, fontsize=8)
     figure.savefig(images / "merge-trust.png", dpi=110)
+
+
+def calibration(records: list[dict[str, Any]]) -> list[tuple[float, float, dict[str, float]]]:
+    """How often scans are right, by their confidence (from, to), over all records that say so of each."""
+    confidence, right = (np.concatenate([record[key] for record in records]) for key in ("confidence", "right"))
+    bins = [(low, high, (confidence >= low) & (confidence < high)) for low, high in pairwise(EDGES)]
+    return [
+        (low, high, {"scans": len(right[own]), "said": confidence[own].mean(), "right": right[own].mean()})
+        for low, high, own in bins
+        if own.any()
+    ]
 
 
 def main() -> None:
@@ -401,9 +430,12 @@ def main() -> None:
     parser.add_argument("--voxel-size", type=float, default=0.003, help="of Open3D, set by hand")
     parser.add_argument("--scans", type=int, nargs="+")
     parser.add_argument("--step", type=float, default=24.0, help="degrees between views")
+    parser.add_argument("--noise", type=float, default=0.002, help="of views, as a share of the radius")
+    parser.add_argument("--poles", action="store_true", help="views from above and below, too")
     parser.add_argument("--points", type=int)
     parser.add_argument("--graphs", type=int, default=40)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="folder of registered pairs")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     if given.what == "plot":
@@ -412,18 +444,21 @@ def main() -> None:
     if given.what == "objects":
         records = objects(given.paths, given.voxel_size, given.jobs)
     elif given.what == "views":
-        records = views(given.paths, (given.scans or [15])[0], given.step, given.points or 20_000, given.jobs)
+        records = views(given)
     elif given.what == "rooms":
-        records = rooms(given.scans or [60], given.points or 50_000, given.jobs, None)
+        records = rooms(given.scans or [60], given.points or 50_000, given, None)
     elif given.what == "growth":
-        records = rooms(given.scans or [10, 25, 50, 100, 200], given.points or 3000, given.jobs, 4)
+        records = rooms(given.scans or [10, 25, 50, 100, 200], given.points or 3000, given, 4)
     elif given.what == "pairs":
-        records = registered_by_truth(given.scans or [10, 25, 50, 100, 200], given.points or 3000)
+        records = registered_by_truth(given.scans or [10, 25, 50, 100, 200], given.points or 3000, given)
     else:
         records = trust(given.graphs)
     if given.json is not None:
+        parts = json.loads(given.json.read_text()) if given.json.exists() else {}
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        given.json.write_text(json.dumps({"date": date, "idam": idam.__version__, "records": records}, indent=1))
+        command = f"benchmarks/merge.py {given.what}"
+        parts[given.what] = {"command": command, "date": date, "idam": idam.__version__, "records": records}
+        given.json.write_text(json.dumps(parts, indent=1) + "\n")
 
 
 if __name__ == "__main__":

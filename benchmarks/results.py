@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import merge
 import scans
 
 from idam.lab.evaluation.paper import PAPER
@@ -225,20 +226,48 @@ def confidences(record: dict[str, Any]) -> str:
     return "\n".join(["## Confidence, each family left out of the fit", "", families(record["left out"]), "", about])
 
 
-def merged(record: dict[str, Any]) -> str:
-    """Where merging many scans puts them, next to Open3D's multiway registration."""
-    rows = record["records"]
-    lines = [line(["scans", "method", "right", "worst", "median", "seconds"]), line(["---"] * 6)]
-    for row in rows:
+def many(parts: dict[str, Any]) -> str:
+    """Where merging many scans puts them: next to Open3D's multiway registration, on ray-cast scans, by confidence."""
+    lines = [line(["scans", "method", "right", "worst", "median", "CPU s"]), line(["---"] * 6)]
+    for row in parts["objects"]["records"]:
         degrees, shift = ([error[n] for error in row["errors"]] for n in (0, 1))
         worst = f"{max(degrees):.2f} degrees, {1000 * max(shift):.2f} mm"
         cells = [row["set"], row["method"], f"{row['right']} of {len(row['errors'])}", worst]
         lines.append(line([*cells, f"{statistics.median(degrees):.2f} degrees", f"{row['seconds']:.1f}"]))
     about = (
-        f"- `benchmarks/merge.py objects FOLDER`: {record['date'][:10]}. Right is within 2 degrees and 2 mm. The truth "
-        "is good to 0.5 degrees and 1 mm. Open3D's graph on idam's links takes its time besides that of the links."
+        f"- `{parts['objects']['command']} FOLDER`: {parts['objects']['date'][:10]}. Right is within 2 degrees and "
+        "2 mm. The truth is good to 0.5 degrees and 1 mm. Open3D's graph on idam's links takes its time besides that "
+        "of the links."
     )
-    return "\n".join(["## Many scans", "", *lines, "", about])
+    sites = [part for part in ("views", "rooms", "growth") if part in parts]
+    records = [record for part in sites for record in parts[part]["records"]]
+    commands = "; ".join(f"`{parts[part]['command']}`, {parts[part]['date'][:10]}" for part in sites)
+    explained = (
+        f"- Ray-cast scans: {commands}. Right is relative to the first scan of the component. CPU time of all "
+        "processes; memory is the most that all have together; there are none where pairs were kept from another run."
+    )
+    by_confidence = [
+        line([f"{low:.2f} to {high:.2f}", f"{row['scans']}", f"{row['said']:.3f}", f"{row['right']:.3f}"])
+        for low, high, row in merge.calibration(records)
+    ]
+    head = [line(["confidence", "scans", "mean confidence", "share right"]), line(["---"] * 4)]
+    tables = [[*lines, "", about], [*map(line, sites_table(records)), "", explained], [*head, *by_confidence]]
+    last = "- The scans of the table above, by their confidence."
+    return "\n\n".join(["## Many scans", *("\n".join(each) for each in tables), last])
+
+
+def sites_table(records: list[dict[str, Any]]) -> list[list[str]]:
+    """A line for each merge of ray-cast scans."""
+    columns = ["scans", "pairs", "components", "right", "sure", "sure and wrong", "worst", "CPU s", "GB"]
+    rows = [columns, ["---"] * len(columns)]
+    for record in records:
+        parts = ", ".join(str(size) for size in record["components"] if size > 1) or "none"
+        right = f"{sum(record['right']) + sum(size > 1 for size in record['components'])} of {record['scans']}"
+        worst = f"{record['worst'][0]:.2f} degrees, {record['worst'][1]:.3f}"
+        cpu, memory = ("" if value is None else f"{value:.3g}" for value in (record["cpu"], record["memory"]))
+        counts = [record["sure"], record["sure_and_wrong"]]
+        rows.append([record["name"], str(record["pairs"]), parts, right, *map(str, counts), worst, cpu, memory])
+    return rows
 
 
 def trust(record: dict[str, Any]) -> str:
@@ -309,7 +338,7 @@ def main() -> None:
     sections += [efficiency(record) for record in records if "median_ms" in record]
     sections += [scale(content) for content in files if isinstance(content, list)]
     sections += [real_scans(record) for record in records if "overlap" in record.get("records", [{}])[0]]
-    sections += [merged(record) for record in records if "errors" in record.get("records", [{}])[0]]
+    sections += [many(record) for record in records if "objects" in record]
     sections += [precision(record) for record in records if "nees" in record.get("rows", [{}])[0]]
     sections += [trust(record) for record in records if "families" in record]
     sections += [confidences(record) for record in records if "left out" in record]

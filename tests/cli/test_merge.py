@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -212,24 +216,109 @@ def test_run_again_it_goes_on_from_the_pairs_it_has(work: Path, call: Call, call
     assert (work / "out" / "poses.json").read_bytes() == poses
 
 
-@processes
-def test_a_killed_run_leaves_no_process_and_no_half_file_and_goes_on(tmp_path: Path) -> None:
+@pytest.fixture
+def command(tmp_path: Path) -> list[str]:
+    """The command that merges four scans in two processes."""
     (tmp_path / "scans").mkdir()
     for view, scan in enumerate(world(4, seed=3, points=600, seen=0.8).scans):
         write_point_cloud(tmp_path / "scans" / f"view{view}.ply", scan)
+    folders = str(tmp_path / "scans"), "-o", str(tmp_path / "out")
+    return [sys.executable, "-m", "idam", "merge", *folders, "-q", "--jobs", "2"]
+
+
+@processes
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT])
+def test_a_stopped_run_leaves_no_process_and_no_half_file_and_goes_on(
+    tmp_path: Path, command: list[str], stop: signal.Signals
+) -> None:
     kept = tmp_path / "out" / "pairs.jsonl"
-    command = [sys.executable, "-m", "idam", "merge", str(tmp_path / "scans"), "-o", str(tmp_path / "out"), "-q"]
-    run = subprocess.Popen([*command, "--jobs", "2"], env=ENVIRONMENT, start_new_session=True)
+    run = subprocess.Popen(command, env=ENVIRONMENT, start_new_session=True, stderr=subprocess.PIPE, text=True)
     assert until(lambda: kept.exists() and kept.read_bytes().count(b"\n") >= 1, 120)
     below = descendants(run.pid)
-    run.kill()
-    run.wait()
+    if stop == signal.SIGINT:
+        os.killpg(run.pid, stop)  # as a terminal's Ctrl-C, which reaches all
+        assert run.communicate(timeout=60)[1] == "idam: interrupted: run the same command to go on\n"
+        assert run.returncode == 130
+    else:
+        run.kill()
+        run.communicate(timeout=60)
     assert until(lambda: not alive(below))
     assert files_in(tmp_path / "out") == {"pairs.jsonl"}
     done = kept.read_text().split("\n")[0]
-    assert subprocess.run([*command, "--jobs", "1"], env=ENVIRONMENT, timeout=120, check=False).returncode == 0
+    again = subprocess.run([*command, "--jobs", "1"], env=ENVIRONMENT, timeout=120, check=False)
+    assert again.returncode == 0
     assert kept.read_text().startswith(done)
     assert len(kept.read_text().splitlines()) == 6
+    calm = subprocess.run([*command, "-o", str(tmp_path / "calm")], env=ENVIRONMENT, timeout=120, check=False)
+    assert calm.returncode == 0
+    differ = {"pairs.jsonl", "report.html"}  # the order in which pairs were done; the time it took
+    for name in files_in(tmp_path / "calm") - differ:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes(), name
+
+
+@processes
+def test_a_worker_that_is_killed_costs_nothing(tmp_path: Path, command: list[str]) -> None:
+    run = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    assert until(lambda: len(workers(run.pid)) == 2, 60)
+    os.kill(workers(run.pid)[0], signal.SIGKILL)
+    assert run.communicate(timeout=120)[1] == ""
+    assert run.returncode == 0
+    assert len((tmp_path / "out" / "pairs.jsonl").read_text().splitlines()) == 6
+
+
+def workers(process: int) -> list[int]:
+    """The processes below one that register pairs, less those that help Python to keep count."""
+    found = []
+    for below in descendants(process):
+        with contextlib.suppress(OSError):
+            found += [below] if b"spawn_main" in Path(f"/proc/{below}/cmdline").read_bytes() else []
+    return found
+
+
+def test_scans_of_one_name_are_told_apart_by_their_folders(work: Path, call: Call, calls: list[Any]) -> None:
+    for name in NAMES[:3]:
+        (work / name[:-4]).mkdir()
+        (work / "scans" / name).rename(work / name[:-4] / "scan.ply")
+    folders = [name[:-4] for name in NAMES[:3]]
+    run = call(*folders, "scans/view3.ply", "-o", "out", "--reference", "view1/scan.ply")
+    assert run.code == 0, run
+    names = [*(f"{folder}/scan.ply" for folder in folders), "view3.ply"]
+    assert list(json.loads((work / "out" / "poses.json").read_text())) == names
+    assert {str(path.relative_to(work / "out" / "transforms")) for path in transforms(work)} == {
+        f"{name}.txt" for name in names
+    }
+    np.testing.assert_array_equal(read_transform(work / "out" / "transforms" / "view1" / "scan.ply.txt"), np.eye(4))
+    unclear = call(*folders, "scans/view3.ply", "-o", "again", "--reference", "scan.ply")
+    assert unclear.code == 2
+    assert "may be view0/scan.ply or view1/scan.ply" in unclear.err
+
+
+def transforms(work: Path) -> list[Path]:
+    return [path for path in (work / "out" / "transforms").rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("reference", ["view2.ply", "scans/view2.ply", "view2"])
+def test_the_reference_may_be_its_path(work: Path, call: Call, calls: list[Any], reference: str) -> None:
+    assert call("scans", "-o", "out", "--reference", reference).code == 0
+    np.testing.assert_array_equal(read_transform(work / "out" / "transforms" / "view2.ply.txt"), np.eye(4))
+
+
+def test_files_that_no_merge_wrote_stay(work: Path, call: Call, calls: list[Any]) -> None:
+    mine = [work / "out" / "transforms" / "mine.txt", work / "out" / "merged.ply", work / "out" / "notes.txt"]
+    mine[0].parent.mkdir(parents=True)
+    for path in mine:
+        path.write_text("mine")
+    (work / "out" / "poses.json").write_text("{")
+    call("scans", "-o", "out", "--no-cloud")
+    call("scans", "-o", "out", "--no-cloud", "--reference", "view1.ply")
+    assert mine[0].read_text() == "mine"
+    assert mine[2].read_text() == "mine"
+
+
+def test_a_file_that_is_not_there_is_named(work: Path, call: Call, calls: list[Any]) -> None:
+    run = call("scans", "scans/view9", "-o", "out")
+    assert run.code == 1
+    assert "no such file" in run.out
 
 
 def test_fewer_scans_leave_no_transform_of_others(work: Path, call: Call, calls: list[Any]) -> None:
@@ -256,13 +345,26 @@ def test_options_reach_the_registration(work: Path, call: Call, calls: list[Any]
         (["scans/view0.ply"], "at least 2"),
         (["scans", "--reference", "nobody.ply"], "nobody.ply"),
         (["scans", "--threshold", "2"], "threshold"),
+        (["scans", "--reference", "view"], "view0.ply"),
         (["scans", "--poses", "scans/view0.ply"], "holds no poses"),
+        (["scans", "--poses", "list.json"], "holds no poses"),
+        (["scans", "--poses", "others.json"], "none of the scans"),
+        (["scans", "--poses", "stretched.json"], "not a rigid transform"),
         (["scans", "scans"], "have this name"),
+        (["scans", "scans/view0.ply"], "have this name"),
+        (["none"], "no file of a point cloud"),
+        (["one"], "at least 2"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
     work: Path, call: Call, calls: list[Any], args: list[str], words: str
 ) -> None:
+    (work / "none").mkdir()
+    (work / "one").mkdir()
+    shutil.copy(work / "scans" / "view0.ply", work / "one")
+    (work / "list.json").write_text("[]")
+    (work / "others.json").write_text(json.dumps({"nobody.ply": np.eye(4).tolist()}))
+    (work / "stretched.json").write_text(json.dumps({"view0.ply": (2 * np.eye(4)).tolist()}))
     run = call(*args, "-o", "out")
     assert run.code == 2, run
     assert words in run.err

@@ -216,15 +216,17 @@ def test_bad_options_are_refused(object_: tuple[World, Registers], options: dict
     assert registers.calls == []
 
 
-def test_fewer_than_two_scans_or_names_twice_are_refused(tmp_path: Path, object_: tuple[World, Registers]) -> None:
+def test_fewer_than_two_scans_or_one_given_twice_are_refused(tmp_path: Path, object_: tuple[World, Registers]) -> None:
     made, _ = object_
     with pytest.raises(InputError, match="at least 2"):
         merge(made.scans[:1])
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         write_point_cloud(tmp_path / folder / "scan.ply", made.scans[0])
+    result = merge([tmp_path / "a" / "scan.ply", tmp_path / "b" / "scan.ply"])
+    assert result.names == ["a/scan.ply", "b/scan.ply"]
     with pytest.raises(InputError, match="2 scans have this name"):
-        merge([tmp_path / "a" / "scan.ply", tmp_path / "b" / "scan.ply"])
+        merge([tmp_path / "a" / "scan.ply", tmp_path / "b" / ".." / "a" / "scan.ply"])
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="no file of a point cloud"):
         merge(tmp_path / "none")

@@ -19,8 +19,10 @@ from idam.many.frame import Frame
 from idam.many.joint import correspondences, linearised, misses, scale, spreads
 from idam.many.pairs import Kept
 from idam.many.partners import PUT_TO_VOTE, all_pairs, candidates, likeliness, signatures, vote
-from idam.many.scans import Thinned, described, read_scans
+from idam.many.scans import Thinned, described, read_scans, thinned
+from many.worlds import surface as lumpy
 from many.worlds import world
+from rooms import room
 
 RANDOM = np.random.default_rng(0)
 
@@ -196,6 +198,14 @@ def test_the_two_faces_of_a_wall_do_not_pull_on_each_other() -> None:
     unknown = replace(front, faces=False)
     mine, _ = correspondences(unknown, behind, np.eye(4), 0.2, 10_000)
     assert ((np.abs(front.points[mine, 0]) < 0.03) & (front.points[mine, 2] > -0.95)).sum() > 500
+
+
+def test_scans_count_as_scans_where_most_of_the_others_are() -> None:
+    scans, model = [room(3000), room(3000, seed=1)], lumpy(0, 3000, np.random.default_rng(0))
+    _, one_model = read_scans([*scans, model])
+    assert all(each.faces for each in thinned(one_model, 1.0))
+    _, two_models = read_scans([scans[0], model, model + 1.0])
+    assert [each.faces for each in thinned(two_models, 1.0)] == [True, False, False]
 
 
 def test_surfaces_apart_weigh_less_than_those_that_are_the_same() -> None:

@@ -10,11 +10,11 @@ from typing import Any
 
 from idam.batch.local import TIME_LIMIT
 from idam.batch.pairs import Pair
-from idam.batch.rows import Row
+from idam.batch.rows import Row, failed_row
 from idam.batch.work import Work
-from idam.batch.worker import Worker
 from idam.errors import InputError, MissingDependencyError
 from idam.io.files import one_line
+from idam.processes import Worker
 
 __all__ = ["run"]
 
@@ -81,7 +81,7 @@ class _Actor:
     """Holds a worker process, and with it the model and the scans it kept."""
 
     def __init__(self, build: Callable[[], Work], limit: float) -> None:
-        self._worker = Worker(build, limit)
+        self._worker = Worker(build, failed_row, limit)
 
     def __call__(self, batch: dict[str, Any]) -> dict[str, list[str]]:
         return {"row": [json.dumps(self._row(pickle.loads(pair))) for pair in batch["pair"]]}

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
 from idam.batch.pairs import Pair
-from idam.batch.rows import Row
+from idam.batch.rows import Row, failed_row
 from idam.batch.work import Work
-from idam.batch.worker import Worker
+from idam.processes import Worker, cores
 
-__all__ = ["TIME_LIMIT", "cores", "run"]
+__all__ = ["TIME_LIMIT", "run"]
 
 TIME_LIMIT = 600.0
 """Seconds a pair may take unless told otherwise: hundreds of times what a pair of a million points each takes."""
@@ -34,10 +33,10 @@ def run(
     """
     waiting = deque(pairs)
     jobs = min(jobs or cores(), len(waiting))
-    workers = [Worker(build, limit) for _ in range(jobs)]
-    shares: dict[Worker, deque[Pair]] = {worker: deque() for worker in workers}
+    workers = [Worker(build, failed_row, limit) for _ in range(jobs)]
+    shares: dict[Worker[Pair], deque[Pair]] = {worker: deque() for worker in workers}
 
-    def feed(worker: Worker) -> None:
+    def feed(worker: Worker[Pair]) -> None:
         share = shares[worker]
         if not share:
             share.extend(waiting.popleft() for _ in range(min(RUN, -(-len(waiting) // (4 * jobs)))))
@@ -57,8 +56,3 @@ def run(
     finally:
         for worker in workers:
             worker.stop()
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

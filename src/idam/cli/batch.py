@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from idam.cli.shared import UNSURE, tell
+from idam.cli.shared import INTERRUPTED, UNSURE, tell
 from idam.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from idam.batch.rows import Row
 
 __all__ = ["batch"]
-
-INTERRUPTED = 130
 
 
 def batch(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from idam.cli.shared import UNSURE
+from idam.cli.shared import INTERRUPTED, UNSURE
 from idam.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,25 +53,30 @@ def merge(
     from idam.io import check_writable, make_folder
     from idam.many.files import KEPT, read_poses, write_merge
     from idam.many.merge import merge as run
+    from idam.processes import cores
     from idam.report.merge import write_merge_report
 
     check_apart(scans, output)
     starting = None if poses is None else read_poses(poses)
     make_folder(output)
     check_writable(output / "merged.ply")
-    with progress_shown(quiet) as progress:
-        result = run(
-            scans,
-            reference=reference,
-            voxel_size=voxel_size,
-            partners=partners,
-            jobs=cores() if jobs is None else jobs,
-            threshold=threshold,
-            poses=starting,
-            strict=strict,
-            keep=output / KEPT,
-            progress=progress,
-        )
+    try:
+        with progress_shown(quiet) as progress:
+            result = run(
+                scans,
+                reference=reference,
+                voxel_size=voxel_size,
+                partners=partners,
+                jobs=cores() if jobs is None else jobs,
+                threshold=threshold,
+                poses=starting,
+                strict=strict,
+                keep=output / KEPT,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        print("idam: interrupted: run the same command to go on", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
     write_merge(output, result, cloud=not no_cloud)
     write_merge_report(output / "report.html", result)
     if not quiet:
@@ -89,12 +93,6 @@ def check_apart(scans: list[Path], output: Path) -> None:
             raise InputError(
                 f"{output}: holds scans to merge: write to a folder of its own, such as {output / 'merged'}"
             )
-
-
-def cores() -> int:
-    """How many processes may run at once."""
-    allowed = getattr(os, "sched_getaffinity", None)  # not on macOS and Windows
-    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def show(result: MergeResult, output: Path) -> None:

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from idam.io import PointCloud
     from idam.result import RegistrationResult
 
-__all__ = ["BAD_INPUT", "UNSURE", "Data", "left_out", "read", "show", "tell"]
+__all__ = ["BAD_INPUT", "INTERRUPTED", "UNSURE", "Data", "left_out", "read", "show", "tell"]
 
 UNSURE = 1
 BAD_INPUT = 2
+INTERRUPTED = 130
 
 Data = Annotated[Path, typer.Option("--data", help="Folder of ModelNet40 (modelnet40_ply_hdf5_2048).")]
 

@@ -26,10 +26,12 @@ def fuse(clouds: Sequence[PointCloud], voxel_size: float, numbers: Sequence[int]
         attribute ``scan``. Colours and normals where every cloud has them: others would have to be made up.
 
     Raises:
-        InputError: there is no cloud, or the voxels are too small to be numbered.
+        InputError: there is no cloud, or the voxel size is no length, or too small for the voxels to be numbered.
     """
     if not clouds:
         raise InputError("no scan has a pose: there is nothing to make one cloud of")
+    if not 0 < voxel_size < np.inf:
+        raise InputError(f"voxel_size must be a positive number, not {voxel_size!r}")
     points = np.concatenate([cloud.points for cloud in clouds])
     low = points.min(0)
     cells = np.floor((points - low) / voxel_size)

@@ -37,6 +37,7 @@ def write_merge(folder: Path, result: MergeResult, cloud: bool = True) -> list[P
         InputError: one cannot be written.
     """
     make_folder(folder)
+    remove_earlier(folder)
     transforms = make_folder(folder / "transforms")
     placed = [scan for scan in result.components[0] if result.poses[scan] is not None]
     write_json(folder / "poses.json", poses_json(result))
@@ -46,17 +47,29 @@ def write_merge(folder: Path, result: MergeResult, cloud: bool = True) -> list[P
     write_text(folder / "poses.kitti", "".join(map(kitti, poses)))
     write_text(folder / "poses.kitti.names", "".join(f"{result.names[scan]}\n" for scan in sorted(placed)))
     write_text(folder / "graph.g2o", g2o(result))
-    for old in (*transforms.glob("*.txt"), folder / "merged.ply"):  # of an earlier run with other scans or poses
-        with contextlib.suppress(OSError):
-            old.unlink()
     for name, pose in zip(result.names, result.poses, strict=True):
         if pose is not None:
-            write_text(transforms / f"{name}.txt", format_transform(pose) + "\n")
+            path = transforms / f"{name}.txt"
+            make_folder(path.parent)
+            write_text(path, format_transform(pose) + "\n")
     names = ["poses.json", "poses.tum", "poses.kitti", "graph.g2o", "transforms"]
     if cloud and placed:
         write_point_cloud(folder / "merged.ply", result.merged())
         names.append("merged.ply")
     return [folder / name for name in names]
+
+
+def remove_earlier(folder: Path) -> None:
+    """Remove what an earlier run left that this one may not write: other scans' transforms, and the merged cloud."""
+    try:
+        names = list(read_poses(folder / "poses.json"))
+    except InputError:  # there was none: what else is here is no merge's
+        return
+    transforms = (folder / "transforms").resolve()
+    ours = [path for name in names if (path := (transforms / f"{name}.txt").resolve()).is_relative_to(transforms)]
+    for old in (*ours, folder / "merged.ply"):
+        with contextlib.suppress(OSError):
+            old.unlink()
 
 
 def read_poses(path: StrPath) -> dict[str, Array]:
@@ -67,6 +80,8 @@ def read_poses(path: StrPath) -> dict[str, Array]:
     """
     try:
         content = json.loads(read_bytes(path))
+        if not isinstance(content, dict):
+            raise ValueError(f"a {type(content).__name__}, not an object")
         entries = {name: each["matrix"] if isinstance(each, dict) else each for name, each in content.items()}
         poses = {name: np.array(matrix, np.float64) for name, matrix in entries.items() if matrix is not None}
     except InputError:

@@ -25,7 +25,10 @@ from idam.rigid import Array, Rows
 __all__ = ["all_overlaps", "overlaps", "refine"]
 
 REACH = 2.0
-"""Spacings within which points pull on each other: the last refinement of a pair has it, too."""
+"""Spacings within which a point lies on another scan."""
+PULL = 1.0
+"""Spacings within which points pull on each other. With 2, what lies behind walls and beside edges pulled 50 sparse
+scans of a building off by up to 0.19 m, where it is 0.01 with 1; on dense scans and objects the two are alike."""
 LEAST = 0.1
 """Share of a scan's points on another from which the two count as overlapping."""
 NEARLY_ALL = 0.95
@@ -120,7 +123,7 @@ def refine(poses: Array, surfaces: Sequence[Thinned], components: Sequence[Seque
         return poses
     target, source = np.array(pairs, np.int64).T
     elimination = Elimination(len(poses), source, target)
-    reach = REACH * max(surfaces[scan].spacing for pair in pairs for scan in pair)
+    reach = PULL * max(surfaces[scan].spacing for pair in pairs for scan in pair)
     for _ in range(STEPS):
         relative = [rigid.inverse(poses[other]) @ poses[one] for other, one in pairs]
         matched = [
@@ -145,7 +148,7 @@ def refine(poses: Array, surfaces: Sequence[Thinned], components: Sequence[Seque
             right[other] += back.T @ gradient
         step = elimination.solve(diagonal, across, right, DAMPING)
         poses = straight(poses @ rigid.exp(step))
-        if np.abs(step).max() < STILL * reach / REACH:
+        if np.abs(step).max() < STILL * reach / PULL:
             break
     return poses
 

@@ -33,10 +33,6 @@ class Loops:
         """How many loops of each of so many links close, (L,)."""
         return np.bincount(self.links[self.closes].ravel(), minlength=count)
 
-    def around(self, count: int) -> Rows:
-        """How many loops each of so many links is in, (L,)."""
-        return np.bincount(self.links.ravel(), minlength=count)
-
 
 def find_loops(count: int, links: Links) -> Loops:
     """All loops of three links among ``count`` scans, each once."""

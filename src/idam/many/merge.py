@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from idam.errors import InputError
-from idam.io import rigid_fault
 from idam.io.files import StrPath
-from idam.many import joint
+from idam.many import joint, starting
 from idam.many.choice import Choice
 from idam.many.frame import Frame
+from idam.many.names import find
 from idam.many.pairs import Kept, Pair, Row, Workers, register_pairs
 from idam.many.partners import likeliness
 from idam.many.posed import Posed, pose
 from idam.many.result import MergeResult
-from idam.many.scans import Scan, described, read_scans, thinned
-from idam.many.suggested import Suggested
-from idam.registration import as_rigid, check_options
+from idam.many.scans import Scan, described, read_scans, spacing, thinned
+from idam.many.starting import StartingPoses
+from idam.registration import check_options
 from idam.rigid import Array
 
 __all__ = ["THRESHOLD", "merge"]
@@ -79,34 +79,33 @@ def merge(
     check(partners, jobs, threshold)
     names, read = read_scans(scans, strict)
     some = [scan for scan in read if isinstance(scan, Scan)]
-    first = find(reference, names, some)
+    first = None if reference is None else usable(find(reference, names), names, read)
     options = {} if voxel_size is None else {"voxel_size": voxel_size}
     frame = Frame.of(some)
-    given = starting_poses(poses, some)
+    given = starting.given(poses, some)
     surfaces = thinned(some, frame.unit)
-    suggested = Suggested.of(given, frame, surfaces)
+    start = StartingPoses.of(given, frame, surfaces)
     rows, kept = dict[Pair, Row](), Kept(keep)
     choice = Choice(len(some), partners, lambda: likeliness(*described(some)))
     posed = Posed.nothing(len(some))
-    pairs = choice.first(suggested.overlaps) or choice.next(posed.unsure, posed.held, {}, range(len(some)))
+    pairs = choice.first(start.overlaps) or choice.next(posed.unsure, posed.held, {}, range(len(some)))
     with Workers(some, jobs) as workers:
         while pairs:
-            rows |= register_pairs(some, pairs, options, suggested.guesses, kept, workers, progress)
+            rows |= register_pairs(some, pairs, options, start.guesses, kept, workers, progress)
             progress("pose graph", 0, 1)
             posed = pose(some, frame, rows, threshold, first)
-            unsure = sorted({*posed.unsure, *suggested.contradicted(posed)})
+            unsure = sorted({*posed.unsure, *start.contradicted(posed)})
             overlaps = joint.all_overlaps(posed.poses, surfaces, posed.trust.components)
             pairs = choice.next(unsure, posed.held, overlaps, posed.component)
     progress("joint refinement", 0, 1)
     refined = joint.refine(posed.poses, surfaces, posed.trust.components)
     if posed.contradicts(refined):
         refined = posed.poses
-    spacing = frame.unit * max(surface.spacing for surface in surfaces)
-    return collect(names, read, posed, frame.leave(refined, posed.trust.components), spacing, started)
+    return collect(names, read, posed, frame.leave(refined, posed.trust.components), spacing(some), started)
 
 
 def collect(
-    names: list[str], read: list[Scan | str], posed: Posed, poses: Array, spacing: float, started: float
+    names: list[str], read: list[Scan | str], posed: Posed, poses: Array, apart: float, started: float
 ) -> MergeResult:
     """The result for all scans given, from that for those that could be read."""
     number = [i for i, scan in enumerate(read) if isinstance(scan, Scan)]
@@ -126,10 +125,17 @@ def collect(
         confidence=confidence,
         reason=reason,
         links=[link.numbered(number) for link in posed.links],
-        spacing=spacing,
+        spacing=apart,
         seconds=time.perf_counter() - started,
         clouds=[scan.cloud if isinstance(scan, Scan) else None for scan in read],
     )
+
+
+def usable(number: int, names: list[str], read: list[Scan | str]) -> int:
+    """The place of a scan among those that can be used."""
+    if isinstance(read[number], str):
+        raise InputError(f"the reference {names[number]} cannot be used ({read[number]}): name another scan")
+    return sum(isinstance(scan, Scan) for scan in read[:number])
 
 
 def check(partners: int | None, jobs: int, threshold: float) -> None:
@@ -139,33 +145,3 @@ def check(partners: int | None, jobs: int, threshold: float) -> None:
             raise InputError(f"{name} must be a whole number above 0, not {value!r}")
     if not (isinstance(threshold, Real) and 0.5 <= threshold < 1):
         raise InputError(f"threshold must be a probability of at least 0.5 and below 1, not {threshold!r}")
-
-
-def find(reference: str | int | None, names: list[str], scans: list[Scan]) -> int | None:
-    """The place of the reference among the scans that can be used."""
-    if reference is None:
-        return None
-    if isinstance(reference, Integral):
-        if not 0 <= int(reference) < len(names):
-            raise InputError(f"reference {reference}: there are scans 0 to {len(names) - 1}")
-        reference = names[int(reference)]
-    place = next((i for i, scan in enumerate(scans) if scan.name == reference), None)
-    if place is None:
-        what = "cannot be used" if reference in names else "is not among the scans"
-        raise InputError(f"reference {reference!r} {what}: name one of {', '.join(names[:3])} ...")
-    return place
-
-
-def starting_poses(poses: Mapping[str, ArrayLike] | None, scans: list[Scan]) -> dict[int, Array]:
-    """The starting poses (4, 4), by the scans' places: those given, else those that the scans' files bring.
-
-    Poses that are all equal say nothing: that is what files hold whose scans were never registered.
-    """
-    if poses is not None:
-        places = {scan.name: place for place, scan in enumerate(scans)}
-        return {places[name]: as_rigid(matrix) for name, matrix in poses.items() if name in places}
-    brought = {
-        place: scan.pose for place, scan in enumerate(scans) if scan.pose is not None and not rigid_fault(scan.pose)
-    }
-    different = len({pose.tobytes() for pose in brought.values()}) > 1
-    return {place: as_rigid(pose) for place, pose in brought.items()} if different else {}

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import json
-import os
-import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing import get_context, parent_process
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from idam.clouds.prepared import Prepared
 from idam.errors import InputError
 from idam.io.files import StrPath, one_line
 from idam.many.scans import Scan
+from idam.processes import Row, Worker
 from idam.rigid import Array
 
-__all__ = ["Kept", "Pair", "Workers", "register_pairs"]
+__all__ = ["Kept", "Pair", "Row", "Workers", "register_pairs"]
 
 Pair = tuple[int, int]
 """Numbers of a source and a target."""
-Row = dict[str, Any]
-"""What is known of a registered pair, as plain numbers and lists."""
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+Task = tuple[Pair, dict[str, Any]]
+"""A pair, and with which options of :func:`idam.register`."""
 
 
 @dataclass
@@ -101,20 +97,17 @@ def register_pairs(
 
     Returns:
         A row for each pair: what registered, or the one line that says why it did not.
-
-    Raises:
-        InputError: a process was killed.
     """
     asked = {pair: options | ({"init": guesses[pair].tolist()} if pair in guesses else {}) for pair in pairs}
     keys = {pair: key_of(scans[pair[0]], scans[pair[1]], asked[pair]) for pair in pairs}
-    waiting = [pair for pair in pairs if keys[pair] not in kept.rows]
-    ready = len(pairs) - len(waiting)
-    progress("pairs registered", ready, len(pairs))
-    for pair, row in workers.results({pair: asked[pair] for pair in waiting}):
-        kept.add(keys[pair], {"source": scans[pair[0]].name, "target": scans[pair[1]].name, **row})
-        ready += 1
-        progress("pairs registered", ready, len(pairs))
-    return {pair: kept.rows[keys[pair]] for pair in pairs}
+    rows = {pair: kept.rows[keys[pair]] for pair in pairs if keys[pair] in kept.rows}
+    progress("pairs registered", len(rows), len(pairs))
+    for pair, row in workers.rows([(pair, asked[pair]) for pair in pairs if pair not in rows]):
+        rows[pair] = {"source": scans[pair[0]].name, "target": scans[pair[1]].name, **row}
+        if not row.get("again"):
+            kept.add(keys[pair], rows[pair])
+        progress("pairs registered", len(rows), len(pairs))
+    return rows
 
 
 def _is_whole(row: Row) -> bool:
@@ -136,7 +129,8 @@ def key_of(source: Scan, target: Scan, options: dict[str, Any]) -> str:
 class Workers:
     """Processes that register pairs of scans; with one, this process does.
 
-    They last until they are closed, and each keeps what it has worked out about a scan.
+    They last until they are closed, and each keeps what it has worked out about a scan. One that dies costs its pair at
+    most: a new one tries it again.
 
     Args:
         scans: all of them.
@@ -144,93 +138,67 @@ class Workers:
     """
 
     def __init__(self, scans: Sequence[Scan], jobs: int):
-        self._prepared, self._jobs = [scan.prepared for scan in scans], jobs
-        self._pool: ProcessPoolExecutor | None = None
+        self._build, self._jobs = partial(Register, [scan.prepared for scan in scans]), jobs
+        self._workers: list[Worker[Task]] = []
 
     def __enter__(self) -> Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+        for worker in self._workers:
+            worker.stop()
 
-    def results(self, asked: Mapping[Pair, dict[str, Any]]) -> Iterator[tuple[Pair, Row]]:
-        """Each pair's row, as soon as it is done, by its options.
-
-        Raises:
-            InputError: a process was killed.
-        """
-        if self._jobs == 1 or (self._pool is None and len(asked) == 1):
-            begin(self._prepared)
-            for pair, options in asked.items():
-                yield pair, register_pair(pair, options)
+    def rows(self, tasks: Sequence[Task]) -> Iterator[tuple[Pair, Row]]:
+        """Each task's pair and its row, as soon as it is done."""
+        if self._jobs == 1 or (not self._workers and len(tasks) == 1):
+            register = self._build()
+            yield from ((task[0], register(task)) for task in tasks)
             return
-        with one_thread_each():  # processes start as they are needed
-            self._pool = self._pool or ProcessPoolExecutor(
-                self._jobs, get_context("spawn"), begin_apart, (self._prepared,)
-            )
-            futures = {self._pool.submit(register_pair, pair, options): pair for pair, options in asked.items()}
+        while len(self._workers) < min(self._jobs, len(tasks)):
+            self._workers.append(Worker(self._build, failed_row))
+        waiting, busy = deque(tasks), dict[Worker[Task], Pair]()
+        while waiting or busy:
+            for worker in self._workers:
+                if worker.free and waiting:
+                    busy[worker] = waiting[0][0]
+                    worker.give(waiting.popleft())
+            Worker.wait(list(busy))
+            for worker in list(busy):
+                if (row := worker.take()) is not None:
+                    yield busy.pop(worker), row
+
+
+@dataclass
+class Register:
+    """Registers pairs of scans; what goes wrong is in the row.
+
+    Attributes:
+        scans: all of them.
+    """
+
+    scans: Sequence[Prepared]
+
+    def __call__(self, task: Task) -> Row:
+        """The row of a task."""
+        import idam
+
+        (source, target), options = task
         try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenProcessPool:
-            raise InputError(
-                "a process was killed, probably for want of memory: run again with fewer jobs; what is done is kept"
-            ) from None
+            result = idam.register(self.scans[source], self.scans[target], **options)
+        except Exception as error:  # a bad pair must not cost the others
+            return {"error": one_line(error)}
+        return {
+            "error": "",
+            "transformation": result.transformation.tolist(),
+            "information": result.information.tolist(),
+            "confidence": result.confidence,
+            "reason": result.reason,
+            "overlap": result.fitness,
+            "residual": result.inlier_rmse,
+            "reach": result.max_correspondence_distance,
+        }
 
 
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """New processes with a thread each for linear algebra: they share the cores."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-_scans: list[Any] = []
-"""In each process: all scans, ready to be registered."""
-
-
-def begin(scans: list[Any]) -> None:
-    """Hand a process the scans."""
-    _scans[:] = scans
-
-
-def begin_apart(scans: list[Any]) -> None:
-    """Hand a process of its own the scans; it ends with the one that started it, however that ends."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    begin(scans)
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def register_pair(pair: Pair, options: dict[str, Any]) -> Row:
-    """Register one pair of the scans that :func:`begin` handed over; what goes wrong is in the row."""
-    import idam
-
-    try:
-        result = idam.register(_scans[pair[0]], _scans[pair[1]], **options)
-    except Exception as error:  # a bad pair must not cost the others
-        return {"error": one_line(error)}
-    return {
-        "error": "",
-        "transformation": result.transformation.tolist(),
-        "information": result.information.tolist(),
-        "confidence": result.confidence,
-        "reason": result.reason,
-        "overlap": result.fitness,
-        "residual": result.inlier_rmse,
-        "reach": result.max_correspondence_distance,
-    }
+def failed_row(_: Task, error: str, __: float) -> Row:
+    """The row of a pair whose process died: another run tries it again."""
+    return {"error": error, "again": True}

@@ -1,4 +1,4 @@
-"""A process that registers one pair after another, and is replaced when it dies or takes too long."""
+"""Processes at work on one task after another, each replaced when it dies or takes too long."""
 
 from __future__ import annotations
 
@@ -11,45 +11,60 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, TypeVar
 
-from idam.batch.pairs import Pair
-from idam.batch.rows import Row, failed_row
-from idam.batch.work import Work
 from idam.errors import InputError
 
-__all__ = ["Worker"]
+__all__ = ["Row", "Worker", "cores"]
+
+Task = TypeVar("Task")
+Row = dict[str, Any]
+"""What becomes of a task."""
 
 TRIES = 2
-"""Times that a pair is begun: its process may have died of something else, the second one hardly."""
+"""Times that a task is begun: its process may have died of something else, the second one hardly."""
 STARTS = 5
 """Processes in a row that may die before they are ready, until it is the program that is at fault."""
+HERE = "here"
+"""What a process says first."""
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1")
 """One thread a process: the processes are what fills the cores."""
 
 
-class Worker:
-    """A process at work on one pair at a time.
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Worker(Generic[Task]):
+    """A process at work on one task at a time. It has one thread, never hears of Ctrl-C, and ends with this process.
 
     Args:
-        build: makes the work; called in the process.
-        limit: seconds that a pair may take.
+        build: makes the work, which turns a task into its row and raises nothing; called in the process.
+        failed: the row of a task that could not be done, of its error and the seconds it took.
+        limit: seconds that a task may take.
     """
 
-    def __init__(self, build: Callable[[], Work], limit: float) -> None:
-        self._build, self._limit = build, limit
+    def __init__(
+        self,
+        build: Callable[[], Callable[[Task], Row]],
+        failed: Callable[[Task, str, float], Row],
+        limit: float = math.inf,
+    ) -> None:
+        self._build, self._make_failed, self._limit = build, failed, limit
         self._ready, self._starts, self._tries = False, 0, 0
-        self._pair: Pair | None = None
+        self._task: Task | None = None
         self._begun, self._deadline = 0.0, math.inf  # on the clock of time.monotonic
         self._start()
 
     @property
     def free(self) -> bool:
-        """Whether it has no pair to register."""
-        return self._pair is None
+        """Whether it has no task."""
+        return self._task is None
 
-    def give(self, pair: Pair) -> None:
-        """Give it a pair; only when it is free."""
-        self._pair, self._tries = pair, 0
+    def give(self, task: Task) -> None:
+        """Give it a task; only when it is free."""
+        self._task, self._tries = task, 0
         self._send()
 
     def take(self) -> Row | None:
@@ -65,21 +80,24 @@ class Worker:
             return self._bury()
         if message is None:
             return self._expire() if late else None
-        if not self._ready:
+        if self._ready:
+            return self._done(message)
+        if message == HERE:
+            self._tell(self._build)
+        else:
             self._ready, self._starts = True, 0
             self._send()
-            return None
-        return self._done(message)
+        return None
 
     @staticmethod
-    def wait(workers: Sequence[Worker]) -> None:
+    def wait(workers: Sequence[Worker[Any]]) -> None:
         """Wait until there is something to :meth:`take` from one of them."""
         first = min(worker._deadline for worker in workers)
         left = None if first == math.inf else max(0.0, first - time.monotonic())
         wait([worker._connection for worker in workers], left)
 
     def stop(self) -> None:
-        """End the process, whatever it is doing: nothing but its pair is lost."""
+        """End the process, whatever it is doing: nothing but its task is lost."""
         self._process.kill()
         self._process.join()
         self._connection.close()
@@ -87,7 +105,8 @@ class Worker:
     def _start(self) -> None:
         context = get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._build), daemon=True)
+        # what it works with is sent once it reads: of a process that dies before, nobody would empty the pipe
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
         with _one_thread(), _no_interrupt():
             self._process.start()
         theirs.close()
@@ -95,38 +114,41 @@ class Worker:
         self._starts += 1
 
     def _send(self) -> None:
-        """Have the process begin its pair, if it is ready and has one."""
-        if not self._ready or self._pair is None:
+        """Have the process begin its task, if it is ready and has one."""
+        if not self._ready or self._task is None:
             return
         self._tries += 1
         self._begun = time.monotonic()
         self._deadline = self._begun + self._limit
+        self._tell(self._task)
+
+    def _tell(self, what: Any) -> None:
         with contextlib.suppress(OSError):  # it has died: there is an end of file to read
-            self._connection.send(self._pair)
+            self._connection.send(what)
 
     def _done(self, row: Row) -> Row:
-        self._pair, self._deadline = None, math.inf
+        self._task, self._deadline = None, math.inf
         return row
 
     def _failed(self, error: str) -> Row:
-        assert self._pair is not None
-        return self._done(failed_row(self._pair, error, time.monotonic() - self._begun))
+        assert self._task is not None
+        return self._done(self._make_failed(self._task, error, time.monotonic() - self._begun))
 
     def _replace(self) -> None:
         self.stop()
         self._start()
 
     def _bury(self) -> Row | None:
-        """Replace a process that died; its pair is tried again, or has failed."""
+        """Replace a process that died; its task is tried again, or has failed."""
         if not self._ready and self._starts >= STARTS:
             raise InputError(
-                "worker processes die before they begin: a script that calls register_pairs must do so below "
+                "worker processes die before they begin: a script must start its work below "
                 "if __name__ == '__main__':, for each of them imports it"
             )
         self._process.join()
         cause = _cause(self._process.exitcode or 0)
         self._replace()
-        if self._pair is None or self._tries < TRIES:
+        if self._task is None or self._tries < TRIES:
             return None
         return self._failed(f"its process died {TRIES} times ({cause})")
 
@@ -135,12 +157,13 @@ class Worker:
         return self._failed(f"took longer than the limit of {self._limit:g} s")
 
 
-def _serve(connection: Connection, build: Callable[[], Work]) -> None:
-    """Make the row of every pair that comes, until the other end closes."""
+def _serve(connection: Connection) -> None:
+    """Make the row of every task that comes, until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal: the first one decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    work = build()
     with contextlib.suppress(EOFError, OSError):
+        connection.send(HERE)
+        work = connection.recv()()
         connection.send("ready")
         while True:
             connection.send(work(connection.recv()))
