@@ -35,9 +35,7 @@ def swapped(matches: FeatureMatches) -> FeatureMatches:
 
 def level(source: np.ndarray, target: np.ndarray) -> PairLevel:
     """Two clouds as they are, of which nobody knows where they were seen from."""
-    return PairLevel(
-        Level(source, ALL), Level(target, ALL), 1.0, FreeSpace((source, source), (target, target), None, None, 0.0)
-    )
+    return PairLevel(Level(source, ALL), Level(target, ALL), 1.0, FreeSpace(source, target, None, None, 0.0))
 
 
 def thinned(points: np.ndarray, count: int) -> np.ndarray:

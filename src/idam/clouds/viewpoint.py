@@ -91,32 +91,29 @@ class DepthMap:
         square = tree.batch_knn_search(direction, min(NEIGHBOUR + 1, len(direction)))[1]
         return cls(eye, ray[seen], surface.normals[seen], length[seen], tree, np.sqrt(square[:, -1]))
 
-    def seen_through(self, points: Array, normals: Array, margin: float) -> tuple[int, int]:
-        """Of points (M, 3) in seen directions, how many lie in front of what was seen, and how many do not.
+    def seen_through(self, points: Array, margin: float) -> tuple[int, int]:
+        """Of the points (M, 3) in seen directions, how many lie in front of what was seen, and how many do not.
 
-        In front means nearer than the tangent planes of what was seen, by a share, and clear of them by more than a
-        margin; and that what was seen is clear of the points' own planes, by their normals (M, 3): on flat ground far
-        away a scan has no more than lines of points, whose normals say little.
+        In front means clear of the tangent planes by more than a margin, and nearer than they are by a share.
         """
         ray = points - self.eye
         length = np.linalg.norm(ray, axis=1)
-        ray, own, length = ray[length > 0], normals[length > 0], length[length > 0]
+        ray, length = ray[length > 0], length[length > 0]
         if len(ray) == 0 or len(self.points) < RAYS:
             return 0, 0
         direction = ray / length[:, None]
         row, square = self.tree.batch_knn_search(direction, RAYS)
         row = row.astype(np.int64)
         seen = np.sqrt(square[:, -1]) <= GAPS * self.beside[row[:, 0]]
-        ray, own, length, direction, row = ray[seen], own[seen], length[seen], direction[seen], row[seen]
-        planes, nearest = self.normals[row], self.length[row]
-        offset = (planes * self.points[row]).sum(-1)
-        slant = np.einsum("mkd,md->mk", planes, direction)
+        ray, length, direction, row = ray[seen], length[seen], direction[seen], row[seen]
+        normals, nearest = self.normals[row], self.length[row]
+        offset = (normals * self.points[row]).sum(-1)
+        slant = np.einsum("mkd,md->mk", normals, direction)
         steep = np.abs(slant) * BENT[1] * nearest > np.abs(offset)  # the others meet the plane too far away, or never
         plane = np.where(steep, offset / np.where(steep, slant, 1.0), BENT[1] * nearest)
         reach = np.minimum(nearest, plane.clip(BENT[0] * nearest, None)).min(1)
-        clear = np.abs(np.einsum("mkd,md->mk", planes, ray) - offset).min(1)
-        beyond = np.abs(np.einsum("mkd,md->mk", self.points[row] - ray[:, None], own)).min(1)
-        front = (length < (1 - SLACK) * reach) & (np.minimum(clear, beyond) > margin)
+        clear = np.abs(np.einsum("mkd,md->mk", normals, ray) - offset).min(1)
+        front = (length < (1 - SLACK) * reach) & (clear > margin)
         return int(front.sum()), int((~front).sum())
 
 
@@ -125,15 +122,15 @@ class FreeSpace:
     """What two scans saw through, and the points that it is asked of, in working coordinates.
 
     Attributes:
-        source: points and their normals, (N, 3) each.
-        target: likewise, (P, 3).
+        source: points (N, 3).
+        target: points (P, 3).
         source_depth: of the source's scan, or None.
         target_depth: of the target's.
         margin: by which a point must lie in front of a surface.
     """
 
-    source: tuple[Array, Array]
-    target: tuple[Array, Array]
+    source: Array
+    target: Array
     source_depth: DepthMap | None
     target_depth: DepthMap | None
     margin: float
@@ -141,15 +138,12 @@ class FreeSpace:
     @classmethod
     def of(cls, source: Surface, target: Surface, eyes: tuple[Array | None, Array | None], margin: float) -> FreeSpace:
         """Of two surfaces, seen from known places or from no one place."""
-        both = []
-        for surface in (source, target):
-            some = slice(None, None, len(surface.points) // ASKED + 1)
-            both.append((surface.points[some], surface.normals[some]))
+        some = [surface.points[:: len(surface.points) // ASKED + 1] for surface in (source, target)]
         maps = [
             None if eye is None else DepthMap.of(surface, eye)
             for surface, eye in zip((source, target), eyes, strict=True)
         ]
-        return cls(both[0], both[1], maps[0], maps[1], margin)
+        return cls(some[0], some[1], maps[0], maps[1], margin)
 
     def violation(self, transformation: Array) -> float:
         """The share of points that a transform (4, 4) puts where the other scan saw through; 0 if nothing is known."""
@@ -158,9 +152,9 @@ class FreeSpace:
             (self.target_depth, self.source, transformation),
             (self.source_depth, self.target, rigid.inverse(transformation)),
         )
-        for depth, (points, normals), way in ways:
+        for depth, points, way in ways:
             if depth is not None:
-                some = depth.seen_through(rigid.apply(way, points), normals @ way[:3, :3].T, self.margin)
+                some = depth.seen_through(rigid.apply(way, points), self.margin)
                 front, behind = front + some[0], behind + some[1]
         return front / (front + behind) if front + behind >= FEWEST else 0.0
 
