@@ -15,6 +15,7 @@ from idam.search.matching import FeatureMatches
 from idam.search.ranking import Answer, same, scored
 from idam.search.scope import Scope
 from idam.search.stages import (
+    APART,
     CONTENDERS,
     STARVED,
     SURE,
@@ -287,6 +288,9 @@ def test_of_answers_as_good_as_the_best_the_one_nearest_to_the_guess_comes_first
     assert smallest_rotation([best, turn, slight, worse], about_z(100)) == [turn, best, slight, worse]
     assert smallest_rotation([best], np.eye(4)) == [best]
     assert smallest_rotation([best, worse], np.eye(4)) == [best, worse]
+    # two attempts at one pose
+    beside = behind(best, 0.4 * TIED, 180 - 0.9 * APART)
+    assert smallest_rotation([best, beside], np.eye(4)) == [best, beside]
 
 
 def test_of_answers_that_are_alike_the_first_stays() -> None:

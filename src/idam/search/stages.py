@@ -52,8 +52,10 @@ VERIFIED = 4
 """Answers at most that are refined on the fine clouds before one is chosen."""
 CONTENDS = 0.3
 """Share of the best score from which on an answer is refined on the fine clouds, too."""
-TIED = 0.2
-"""Logits by which answers are as likely as the best: a symmetric object's poses differ by chance."""
+TIED, APART = 0.2, 30.0
+"""Logits by which answers are as likely as the best: a symmetric object's poses differ by chance. And degrees from the
+best from which on they may be such poses: two that are nearer are two attempts at one (of an indoor pair, 10 degrees
+apart, the worse one was nearer to the guess)."""
 STARVED = 400
 """Points of the smaller cloud, of clouds of different extent, below which both are matched at its own scale. A LiDAR at
 a car's side and the one on its roof: 154 of 1780 points, none of 113 matches right; 709 of 8374, 45 of 600, and right
@@ -230,6 +232,11 @@ def smallest_rotation(answers: list[Answer], guess: Array) -> list[Answer]:
 
     Something has to choose among the poses of a symmetric object, and scans stand upright more often than not.
     """
-    tied = [answer for answer in answers if weight(answer) >= weight(answers[0]) - TIED]
+    best = answers[0]
+    tied = [best]
+    for answer in answers[1:]:
+        turned = np.degrees(rigid.angle(best.transformation[:3, :3].T @ answer.transformation[:3, :3]))
+        if turned > APART and weight(answer) >= weight(best) - TIED:
+            tied.append(answer)
     first = min(tied, key=lambda answer: float(rigid.angle(guess[:3, :3].T @ answer.transformation[:3, :3])))
     return [first, *(answer for answer in answers if answer is not first)]
