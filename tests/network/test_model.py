@@ -298,6 +298,15 @@ def test_every_try_begins_where_the_best_led_and_its_transform_is_the_whole(make
     assert out.iterations is tries[0][2].iterations
 
 
+def test_features_that_do_not_change_with_the_pose_are_tried_from_the_start_too(seasoned, randn, tries):
+    source, target = randn(2, 40, 3), randn(2, 50, 3)
+    model = seasoned(IDAM(Config(features="fpfh", keep_again=(0.75,), trusted=2.0)))
+    model(source, target)
+    assert len(tries) == 3  # the first, from where it led, and from the start
+    keys = tries[2][1]
+    torch.testing.assert_close(keys.points, gather_points(source, keys.index))
+
+
 def test_only_pairs_that_are_not_trusted_go_on(make_model, randn, tries):
     source, target = randn(3, 40, 3), randn(3, 50, 3)
     model = make_model(keep_again=(1.0,), trusted=2.0)

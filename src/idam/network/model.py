@@ -158,16 +158,23 @@ class IDAM(nn.Module):
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
         clouds = Clouds(source, target, *features, *(neighbours or (None, None)))
         for keep in self.config.keep_again:
-            rows = (output.trust < self.config.trusted).nonzero().squeeze(-1)
+            rows = self._untrusted(output)
             if len(rows) == 0:
                 break
             output = better(output, self._again(clouds.pairs(rows), keep, *output.transforms(rows)), rows)
+            rows = self._untrusted(output)
+            if self.features.rotation_invariant and len(rows):  # they are no more alike where a wrong try led
+                output = better(output, self._again(clouds.pairs(rows), keep, *no_motion(source[rows])), rows)
         return output
 
-    def _again(self, clouds: Clouds, keep: float, rotation: Tensor, translation: Tensor) -> Output:
-        """Another try from where the best one so far led, with a share of the points to keep and twice the iterations.
+    def _untrusted(self, output: Output) -> Tensor:
+        """Rows of the pairs whose matches are not to be trusted."""
+        return (output.trust < self.config.trusted).nonzero().squeeze(-1)
 
-        Features that change with the pose are more alike there.
+    def _again(self, clouds: Clouds, keep: float, rotation: Tensor, translation: Tensor) -> Output:
+        """Another try from where a transform leads, with a share of the points to keep and twice the iterations.
+
+        Features that change with the pose are more alike where the best try so far led.
         """
         source, features = apply_transform(clouds.source, rotation, translation), clouds.source_features
         if not self.features.rotation_invariant:
@@ -245,6 +252,11 @@ class IDAM(nn.Module):
                 match = gather_points(target, correspondence)
             rotation, translation = weighted_procrustes(source, match, weight)
         return Iteration(source, score, match, correspondence, validity_logit, weight, rotation, translation)
+
+
+def no_motion(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The rotations (B, 3, 3) and translations (B, 3) that leave points (B, N, 3) where they are."""
+    return torch.eye(3).to(points).expand(len(points), 3, 3), torch.zeros_like(points[:, 0])
 
 
 def better(first: Output, second: Output, rows: Tensor) -> Output:
