@@ -15,12 +15,7 @@ class Config:
         features: ``gnn`` (appendix A), ``fpfh`` or ``invariant``.
         neighbours: K of the GNN's graph.
         normal_radius: radius of FPFH's normals, in the cloud's units.
-        normal_neighbours: points that a normal is taken from at most, itself included. With noise many points and a
-            large radius pay: of the points with a match in 24 noisy pairs, the nearest feature is that of a match for
-            12 % with the defaults, 27 % with radii of 0.2 and 0.3, 28 % with 0.25 and 0.4, 34 % with 60 points besides,
-            and 37 % with 0.25, 60, 0.45 and 200.
         feature_radius: radius of FPFH's histograms, in the cloud's units.
-        feature_neighbours: points that a histogram is taken over at most, itself included.
         channels: channels of the similarity convolution.
         blocks: iterations that have weights of their own.
         iterations: iterations run; those past ``blocks`` use the last block's weights again.
@@ -42,9 +37,7 @@ class Config:
     features: str = "gnn"
     neighbours: int = 12
     normal_radius: float = 0.1
-    normal_neighbours: int = 30
     feature_radius: float = 0.2
-    feature_neighbours: int = 100
     channels: int = 32
     blocks: int = 3
     iterations: int = 3
