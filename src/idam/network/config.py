@@ -22,9 +22,9 @@ class Config:
         keep: share of each cloud's points that hard elimination keeps.
         keep_again: shares to try next, in turn, where the validity says that the matches are not to be trusted: each
             from where the best try so far led, with twice the iterations; and with features that do not change with the
-            pose, also from the start. Empty is the paper's inference. Beyond it, since of two clouds' most significant
-            points too few may be the same: the validity notices, and more points, or features that have become more
-            alike, mend it.
+            pose, from the start before that. Empty is the paper's inference. Beyond it, since of two clouds' most
+            significant points too few may be the same: the validity notices, and more points, or features that have
+            become more alike, mend it.
         trusted: mean validity of the last iteration's matches from which no other try is made.
         keep_matches: share of matches that hybrid elimination keeps.
         soft_matches: match a point to its row's expectation (the mean of the target, weighted by similarity) rather

@@ -158,18 +158,18 @@ class IDAM(nn.Module):
         output = self.match(self.eliminate(source, features[0]), self.eliminate(target, features[1]))
         clouds = Clouds(source, target, *features, *(neighbours or (None, None)))
         for keep in self.config.keep_again:
-            rows = self._untrusted(output)
-            if len(rows) == 0:
-                break
-            output = better(output, self._again(clouds.pairs(rows), keep, *output.transforms(rows)), rows)
-            rows = self._untrusted(output)
-            if self.features.rotation_invariant and len(rows):  # they are no more alike where a wrong try led
-                output = better(output, self._again(clouds.pairs(rows), keep, *no_motion(source[rows])), rows)
+            if self.features.rotation_invariant:  # they are no more alike where a wrong try led
+                output = self._better(output, clouds, keep, anew=True)
+            output = self._better(output, clouds, keep)
         return output
 
-    def _untrusted(self, output: Output) -> Tensor:
-        """Rows of the pairs whose matches are not to be trusted."""
-        return (output.trust < self.config.trusted).nonzero().squeeze(-1)
+    def _better(self, output: Output, clouds: Clouds, keep: float, *, anew: bool = False) -> Output:
+        """The output with another try of the pairs whose matches are not to be trusted, where it is trusted more."""
+        rows = (output.trust < self.config.trusted).nonzero().squeeze(-1)
+        if len(rows) == 0:
+            return output
+        start = no_motion(clouds.source[rows]) if anew else output.transforms(rows)
+        return better(output, self._again(clouds.pairs(rows), keep, *start), rows)
 
     def _again(self, clouds: Clouds, keep: float, rotation: Tensor, translation: Tensor) -> Output:
         """Another try from where a transform leads, with a share of the points to keep and twice the iterations.
