@@ -218,9 +218,9 @@ def test_run_again_it_goes_on_from_the_pairs_it_has(work: Path, call: Call, call
 
 @pytest.fixture
 def command(tmp_path: Path) -> list[str]:
-    """The command that merges four scans in two processes."""
+    """The command that merges five scans in two processes."""
     (tmp_path / "scans").mkdir()
-    for view, scan in enumerate(world(4, seed=3, points=600, seen=0.8).scans):
+    for view, scan in enumerate(world(5, seed=3, points=600, seen=0.8).scans):
         write_point_cloud(tmp_path / "scans" / f"view{view}.ply", scan)
     folders = str(tmp_path / "scans"), "-o", str(tmp_path / "out")
     return [sys.executable, "-m", "idam", "merge", *folders, "-q", "--jobs", "2"]
@@ -248,7 +248,7 @@ def test_a_stopped_run_leaves_no_process_and_no_half_file_and_goes_on(
     again = subprocess.run([*command, "--jobs", "1"], env=ENVIRONMENT, timeout=120, check=False)
     assert again.returncode == 0
     assert kept.read_text().startswith(done)
-    assert len(kept.read_text().splitlines()) == 6
+    assert len(kept.read_text().splitlines()) == 10
     calm = subprocess.run([*command, "-o", str(tmp_path / "calm")], env=ENVIRONMENT, timeout=120, check=False)
     assert calm.returncode == 0
     differ = {"pairs.jsonl", "report.html"}  # the order in which pairs were done; the time it took
@@ -263,7 +263,7 @@ def test_a_worker_that_is_killed_costs_nothing(tmp_path: Path, command: list[str
     os.kill(workers(run.pid)[0], signal.SIGKILL)
     assert run.communicate(timeout=120)[1] == ""
     assert run.returncode == 0
-    assert len((tmp_path / "out" / "pairs.jsonl").read_text().splitlines()) == 6
+    assert len((tmp_path / "out" / "pairs.jsonl").read_text().splitlines()) == 10
 
 
 def workers(process: int) -> list[int]:

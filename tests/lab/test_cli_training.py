@@ -440,7 +440,7 @@ def test_figures_refuse_an_odd_number_of_scans(idam, trainable, tmp_path):
 @pytest.mark.parametrize("columns", [40, 80, 300])
 def test_models_shows_every_model_and_where_it_comes_from_at_any_width(columns, idam, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(columns))
-    outcome = idam("models")
+    outcome = idam("models", "-v")
     assert outcome.code == 0
     for name in list_models():
         told = provenance(name)
