@@ -10,13 +10,14 @@ import pytest
 from answers import EVIDENCE
 from idam.search.doubt import SLIGHT, STRAIGHT, THROUGH, TIED, doubt
 from idam.search.judge import Evidence
+from idam.search.slides import SLIPPABLE
 from motions import rigid
 
 CENTRE = np.array([3.0, -1.0, 0.5])
 POSE = rigid([0.4, -1.0, 0.3], [10.0, 0.0, -2.0])
 ALIKE = "the surfaces that it lays on each other look little alike"
-AHEAD = replace(EVIDENCE, violation=0.0, lead=1.5 * TIED)
-"""Ahead of the next answer, of good overlap, with no point in free space."""
+AHEAD = replace(EVIDENCE, violation=0.0, fixed=0.5 * SLIPPABLE, lead=1.5 * TIED)
+"""Ahead of the next answer, of good overlap, with no point in free space; it may slide."""
 
 
 def about_the_centre(angle: float, shift: float) -> np.ndarray:
@@ -64,6 +65,14 @@ def test_of_two_answers_that_are_tied_it_says_in_what_they_differ(angle: float, 
     assert said(tied, about_the_centre(angle, shift), about_the_centre(45, 9.0)) == reason
     # behind, even: first because it turns least
     assert said(replace(tied, lead=-1.0), about_the_centre(angle, shift)) == reason
+
+
+def test_what_does_not_slide_repeats() -> None:
+    tied = replace(AHEAD, lead=0.0)
+    along = about_the_centre(0.0, 2.5)
+    assert "slide" in said(replace(tied, fixed=0.9 * SLIPPABLE), along)
+    reason = said(replace(tied, fixed=SLIPPABLE), along)
+    assert reason == "the pattern repeats: 2.5 further the scans fit about as well"
 
 
 def test_two_poses_are_named_before_free_space_and_free_space_before_little_overlap() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from idam import rigid
 from idam.rigid import Array
 from idam.search.judge import Evidence
+from idam.search.slides import SLIPPABLE
 
 __all__ = ["doubt"]
 
@@ -29,7 +30,7 @@ def doubt(evidence: Evidence, answers: Array, centre: Array) -> str:
         centre: of the source, (3,).
     """
     if evidence.lead < TIED and len(answers) > 1:
-        return _rival(answers[0], answers[1], centre)
+        return _rival(answers[0], answers[1], centre, slides=evidence.fixed < SLIPPABLE)
     if evidence.violation > THROUGH:
         return f"{100 * evidence.violation:.1f} % of the points lie where the other scan saw through"
     if evidence.overlap < SLIGHT:
@@ -37,10 +38,12 @@ def doubt(evidence: Evidence, answers: Array, centre: Array) -> str:
     return "the surfaces that it lays on each other look little alike"
 
 
-def _rival(answer: Array, other: Array, centre: Array) -> str:
-    """Say in what two equally good answers (4, 4) differ."""
+def _rival(answer: Array, other: Array, centre: Array, *, slides: bool) -> str:
+    """Say in what two equally good answers (4, 4) differ, of scans that slide along each other or do not."""
     turn = float(np.degrees(rigid.angle(answer[:3, :3].T @ other[:3, :3])))
     shift = float(np.linalg.norm(rigid.apply(answer, centre[None]) - rigid.apply(other, centre[None])))
+    if turn < STRAIGHT and not slides:
+        return f"the pattern repeats: {shift:.3g} further the scans fit about as well"
     if turn < STRAIGHT:
         return f"the scans slide along one direction, where their place is not fixed: {shift:.3g} further fits as well"
     if turn > 180 - STRAIGHT:
