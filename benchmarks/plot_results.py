@@ -29,6 +29,7 @@ RECALLS = {"practice": "rotations up to 45 degrees", "practice-any-rotation": "a
 SURE = 0.9
 
 SECOND = {"symmetric_recall": "with symmetric poses", "observable_recall": "without axisymmetric shapes"}
+COLOURS = {"symmetric_recall": ORANGE, "observable_recall": GREY}
 
 Rows = dict[str, dict[str, Any]]
 
@@ -90,7 +91,7 @@ def draw_recalls(rows: dict[str, Rows]) -> Figure:
                 # records from before symmetric poses were counted have the shapes without an axis instead
                 other = "symmetric_recall" if "symmetric_recall" in row else "observable_recall"
                 panel.barh(place - 0.2, row["recall"], 0.38, color=BLUE, label="all shapes")
-                panel.barh(place + 0.2, row[other], 0.38, color=ORANGE, label=SECOND[other])
+                panel.barh(place + 0.2, row[other], 0.38, color=COLOURS[other], label=SECOND[other])
         panel.set_xlim(0, 1)
         panel.set_xlabel("share within 5 degrees and 0.05")
     handles = {label: handle for handle, label in zip(*parts[0][1].get_legend_handles_labels(), strict=True)}
