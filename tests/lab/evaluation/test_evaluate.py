@@ -90,7 +90,7 @@ def test_a_row_asked_for_that_cannot_be_computed_is_an_error(test, built):
 
 def test_the_network_s_rows_take_the_weights_of_their_experiment(test, built):
     evaluate(test, ["gnn-idam", "fpfh-idam-paper", "icp", "register"])
-    assert [what[1] for what in built[::3]] == ["gnn-unseen-shapes", "fpfh-unseen-shapes", None, None]
+    assert [what[1] for what in built[::3]] == ["gnn-unseen-shapes", "fpfh-unseen-shapes-paper", None, None]
 
 
 def test_named_weights_go_to_the_rows_that_take_any(test, built):
