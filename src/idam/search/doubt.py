@@ -42,9 +42,9 @@ def _rival(answer: Array, other: Array, centre: Array, *, slides: bool) -> str:
     """Say in what two equally good answers (4, 4) differ, of scans that slide along each other or do not."""
     turn = float(np.degrees(rigid.angle(answer[:3, :3].T @ other[:3, :3])))
     shift = float(np.linalg.norm(rigid.apply(answer, centre[None]) - rigid.apply(other, centre[None])))
-    if turn < STRAIGHT and not slides:
-        return f"the pattern repeats: {shift:.3g} further the scans fit about as well"
     if turn < STRAIGHT:
+        if not slides:
+            return f"the pattern repeats: {shift:.3g} further the scans fit about as well"
         return f"the scans slide along one direction, where their place is not fixed: {shift:.3g} further fits as well"
     if turn > 180 - STRAIGHT:
         return "the scans fit about as well the other way round"

@@ -116,10 +116,12 @@ def verified(answer: Answer, matching: Matching, fine: Surfaces, method: str) ->
 
 
 def likeliest(transformations: Array, matching: Matching, most: int) -> Array:
-    """The ``most`` likeliest of the transforms (S, 4, 4) as they are, the likeliest first.
+    """The ``most`` likeliest of the transforms (S, 4, 4) as they are, the likeliest first; none of none.
 
     Next to refining an answer, to ask for its likelihood costs nothing; and to refine more of them gains nothing.
     """
+    if len(transformations) == 0:
+        return transformations
     likelihood = matching.likelihoods(transformations)
     order = np.argsort(-likelihood, kind="stable")[:most]
     best = likelihood[order[0]]

@@ -1,7 +1,7 @@
 """Poses that a pose may be mistaken for where a scene repeats, and where it may belong instead: shifted as votes say.
 
 Bays, pillars, stalls and steps lie on each other one further, too. For a given rotation every two points of one normal
-votes for the shift between them, and those with the most votes are places to look at: the right one and the repeats.
+vote for the shift between them, and those with the most votes are places to look at: the right one and the repeats.
 What is rare tells more: walls and floors fix a direction each with most of the points, and a few posts the third. So
 those points vote whose normals the rest has least of: by their leverage in the sum of squared motions along normals.
 """

@@ -164,7 +164,7 @@ def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fi
     answers = ranked(improve(tried, matching, reaches(method)[0], method))
     surfaces, best = matching.clouds.surfaces, answers[0].transformation
     slid, shifted = scope.within(slides(surfaces, best)), scope.within(repeats(surfaces, best))
-    rivals = np.concatenate([likeliest(slid, matching, SLID) if len(slid) else slid, shifted])
+    rivals = np.concatenate([likeliest(slid, matching, SLID), shifted])
     answers = ranked([*answers, *improve(rivals, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
     answers = smallest_rotation(judged(answers[:CONTENDERS], matching, method, fine), scope.guess)
@@ -232,11 +232,12 @@ def smallest_rotation(answers: list[Answer], guess: Array) -> list[Answer]:
 
     Something has to choose among the poses of a symmetric object, and scans stand upright more often than not.
     """
-    best = answers[0]
-    tied = [best]
-    for answer in answers[1:]:
-        turned = np.degrees(rigid.angle(best.transformation[:3, :3].T @ answer.transformation[:3, :3]))
-        if turned > APART and weight(answer) >= weight(best) - TIED:
-            tied.append(answer)
-    first = min(tied, key=lambda answer: float(rigid.angle(guess[:3, :3].T @ answer.transformation[:3, :3])))
+
+    def turned(answer: Answer, pose: Array) -> float:
+        return float(np.degrees(rigid.angle(pose[:3, :3].T @ answer.transformation[:3, :3])))
+
+    best, *others = answers
+    least = weight(best) - TIED
+    tied = [other for other in others if weight(other) >= least and turned(other, best.transformation) > APART]
+    first = min([best, *tied], key=lambda answer: turned(answer, guess))
     return [first, *(answer for answer in answers if answer is not first)]
