@@ -29,10 +29,9 @@ from idam.describe.invariant import surroundings
 from idam.io import read_point_cloud
 from idam.models import resolve
 from idam.rigid import Array
-from idam.search.consensus import agreeing_transforms
 from idam.search.matching import Matching
 from idam.search.scope import Scope
-from idam.search.stages import SEEDS, SPARSE_SEEDS, explain
+from idam.search.stages import SEEDS, SPARSE_SEEDS, explain, proposals
 from idam.solution import dense
 
 
@@ -70,12 +69,13 @@ class Steps:
     def agree(self) -> None:
         """Sets of matches that agree on a motion."""
         seeds = SPARSE_SEEDS if self.clouds.sparse else SEEDS
-        self.candidates = np.concatenate([np.eye(4)[None], agreeing_transforms(self.matching.matches, seeds)])
+        self.agreed, self.most = next(proposals(self.matching, Scope(np.eye(4)), seeds))
 
     def refine_score_and_verify(self) -> None:
         """The likeliest candidates on the matched clouds, the best on the fine ones."""
         self.method = "symmetric" if self.clouds.sparse else "gicp"
-        self.found = explain(self.candidates, self.matching, Scope(np.eye(4)), self.method, self.fine)
+        candidates = np.concatenate([np.eye(4)[None], self.agreed])
+        self.found = explain(candidates, self.matching, Scope(np.eye(4)), self.method, self.fine, self.most)
 
     def last_stage(self) -> None:
         """On the fine clouds, or patches of all points."""

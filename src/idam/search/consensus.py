@@ -16,7 +16,7 @@ from idam.describe.products import product
 from idam.rigid import Array
 from idam.search.matching import FeatureMatches
 
-__all__ = ["agreeing_transforms", "weighted_procrustes"]
+__all__ = ["agreeing_transforms", "brought_together", "nearest_rotations", "solved_anew", "weighted_procrustes"]
 
 COMPANIONS = 20
 """Matches that a seed's first transform is solved from, besides itself."""
@@ -43,13 +43,28 @@ def agreeing_transforms(matches: FeatureMatches, seeds: int) -> Array:
     # the seed itself is compatible with whatever its best companion is
     weight = np.concatenate([weight.max(1, keepdims=True), weight], 1)
     transforms = weighted_procrustes(source[index], target[index], weight.astype(np.float64))
-    moments = _moments(source, target)
-    near = _together(moments, transforms, matches.tolerance)
-    for _ in range(ROUNDS):
-        transforms = weighted_procrustes(source, target, near)
-        near = _together(moments, transforms, matches.tolerance)
-    number = near.sum(1)
-    return transforms[np.argsort(-number, kind="stable")]
+    return solved_anew(matches, brought_together(matches, transforms, matches.tolerance), ROUNDS)
+
+
+def solved_anew(matches: FeatureMatches, near: Array, rounds: int) -> Array:
+    """Transforms (S, 4, 4) solved again and again from what they bring together, (S, M) at first; the best first."""
+    for _ in range(rounds):
+        transforms = weighted_procrustes(matches.source, matches.target, near)
+        near = brought_together(matches, transforms, matches.tolerance)
+    return transforms[np.argsort(-near.sum(1), kind="stable")]
+
+
+def brought_together(matches: FeatureMatches, transforms: Array, tolerance: float) -> Array:
+    """1 for the matches (S, M) that each of S transforms brings within the tolerance, 0 for the others.
+
+    ``|R p + t - q|^2 = p^2 + q^2 + t^2 - 2 q^T R p + 2 t^T R p - 2 t^T q``: for all matches and transforms one product.
+    """
+    rotation, shift = transforms[:, :3, :3], transforms[:, :3, 3]
+    back = (shift[:, None] @ rotation)[:, 0]
+    one, square = np.ones((len(shift), 1)), (shift**2).sum(1, keepdims=True)
+    factors = np.concatenate([one, square, -2 * rotation.reshape(-1, 9), 2 * back, -2 * shift], 1)
+    near: Array = (product(factors, _moments(matches.source, matches.target)) < tolerance**2).astype(np.float64)
+    return near
 
 
 def weighted_procrustes(source: Array, target: Array, weight: Array) -> Array:
@@ -73,11 +88,16 @@ def weighted_procrustes(source: Array, target: Array, weight: Array) -> Array:
         source_mean, target_mean = (np.einsum("sn,snd->sd", weight, points) for points in (source, target))
         centred = weight[:, :, None] * (source - source_mean[:, None])
         covariance = centred.swapaxes(1, 2) @ (target - target_mean[:, None])
-    u, _, vh = np.linalg.svd(covariance)
+    rotation, _ = nearest_rotations(covariance)
+    return rigid.transform(rotation, target_mean - (rotation @ source_mean[:, :, None])[..., 0])
+
+
+def nearest_rotations(covariance: Array) -> tuple[Array, Array]:
+    """The rotations R with the largest traces of R H, for covariances H (S, 3, 3), and singular values of H (S, 3)."""
+    u, values, vh = np.linalg.svd(covariance)
     v = vh.swapaxes(1, 2).copy()
     v[:, :, 2] *= np.linalg.det(v @ u.swapaxes(1, 2))[:, None]
-    rotation = v @ u.swapaxes(1, 2)
-    return rigid.transform(rotation, target_mean - (rotation @ source_mean[:, :, None])[..., 0])
+    return v @ u.swapaxes(1, 2), values
 
 
 def _second_order_compatibility(source: Array, target: Array, tolerance: float) -> NDArray[np.float32]:
@@ -94,19 +114,6 @@ def _moments(source: Array, target: Array) -> Array:
     products = (target[:, :, None] * source[:, None, :]).reshape(-1, 9)
     squares = (source**2).sum(1) + (target**2).sum(1)
     return np.concatenate([squares[None], np.ones((1, len(source))), products.T, source.T, target.T])
-
-
-def _together(moments: Array, transforms: Array, tolerance: float) -> Array:
-    """1 for the matches (S, M) that each of S transforms brings within the tolerance, 0 for the others.
-
-    ``|R p + t - q|^2 = p^2 + q^2 + t^2 - 2 q^T R p + 2 t^T R p - 2 t^T q``: for all matches and transforms one product.
-    """
-    rotation, shift = transforms[:, :3, :3], transforms[:, :3, 3]
-    back = (shift[:, None] @ rotation)[:, 0]
-    one, square = np.ones((len(shift), 1)), (shift**2).sum(1, keepdims=True)
-    factors = np.concatenate([one, square, -2 * rotation.reshape(-1, 9), 2 * back, -2 * shift], 1)
-    near: Array = (product(factors, moments) < tolerance**2).astype(np.float64)
-    return near
 
 
 def _distances(points: Array) -> NDArray[np.float32]:

@@ -150,7 +150,7 @@ def distinct(transformations: Array, most: int | None = None) -> NDArray[np.int6
 
 def same(one: Array, others: Array) -> NDArray[np.bool_]:
     """Which working transforms (..., 4, 4) turn and shift the source nearly the way that one (4, 4) does."""
-    cosine = (np.einsum("ij,...ij->...", one[:3, :3], others[..., :3, :3]) - 1) / 2
-    shift = np.linalg.norm(others[..., :3, 3] - one[:3, 3], axis=-1)
-    near: NDArray[np.bool_] = (cosine > np.cos(np.radians(SAME_ANGLE))) & (shift < SAME_SHIFT)
+    cosine = (others[..., :3, :3].reshape(*others.shape[:-2], 9) @ one[:3, :3].reshape(9) - 1) / 2
+    shift = others[..., :3, 3] - one[:3, 3]
+    near: NDArray[np.bool_] = (cosine > np.cos(np.radians(SAME_ANGLE))) & ((shift**2).sum(-1) < SAME_SHIFT**2)
     return near

@@ -19,6 +19,7 @@ from idam.rigid import Array
 from idam.search.consensus import agreeing_transforms
 from idam.search.judge import Evidence, confidence, evidence, weight
 from idam.search.matching import Matching
+from idam.search.point_pairs import point_pair_transforms
 from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, scored, verified
 from idam.search.repeats import repeats
 from idam.search.scope import Scope
@@ -34,10 +35,13 @@ Network = Callable[[Array], Array]
 SEEDS, SPARSE_SEEDS = 200, 600
 """Matches that sets of agreeing ones are grown from. With 600 as many answers of 108 ray-cast pairs are right, and it
 takes longer; of sparse clouds, fewer miss some of a symmetric object's poses."""
-HYPOTHESES = 64
-"""Different transforms, among those that the sets agree on, whose likelihood is asked for."""
-EXAMINED = 8
-"""The likeliest of them, which are refined."""
+HYPOTHESES, EXAMINED = 64, 8
+"""Different transforms that sets of matches agree on, whose likelihood is asked for; and the likeliest of them, which
+are refined."""
+MORE, CLOSELY = 300, 16
+"""The same where these do not settle the matter: so many that sets grown from every match agree on, and as many of
+every two matches; and as many refined of all of them together. Of 62 real pairs cropped to a seventh to a third of
+overlap, the right one is among the likeliest 16 of the larger clouds for 49, and was for 39."""
 SLID = 6
 """The likeliest of the poses that the best answer may be mistaken for, which are refined, too."""
 CONTENDERS = 6
@@ -100,10 +104,10 @@ def search(
 ) -> Found:
     """The answers that explain both clouds best.
 
-    Small clouds are matched first: that costs least, and mostly it is enough. Where it does not settle the matter,
-    larger ones are, clouds of different extent at the scale of the smaller, and sparse ones by other features; the best
-    answers so far have to stand against what they say. At last a network of the paper's kind, where there is one, has
-    a say.
+    Small clouds are matched first, and sets of matches asked that agree in their distances: that costs least, and
+    mostly it is enough. Where it does not settle the matter, every two matches are asked, and then larger clouds, those
+    of different extent at the scale of the smaller, and sparse ones by other features; the best answers so far have to
+    stand against what they say. At last a network of the paper's kind, where there is one, has a say.
 
     Args:
         clouds: in working coordinates.
@@ -112,22 +116,30 @@ def search(
         scope: the transforms to look into; its guess is an answer to consider.
         method: of refinement, or ``none``.
     """
-    candidates = scope.guess[None]
+    poses = scope.guess[None]
     for level, descriptor in to_match(clouds, descriptors):
         matching = Matching.of(descriptor, level)
-        agreed = scope.within(agreeing_transforms(matching.matches, SPARSE_SEEDS if clouds.sparse else SEEDS))
-        found = explain(np.concatenate([candidates, agreed]), matching, scope, method, clouds.fine.surfaces)
-        sure = confidence(found.evidence)
-        log.info(
-            "%d feature matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure
-        )
         few = level is clouds.small and not clouds.all_small
-        if sure >= SURE and not (found.slides and few):  # what slides can look settled by few points
-            return found
-        candidates = np.array([answer.transformation for answer in found.answers])
+        for agreed, most in proposals(matching, scope, SPARSE_SEEDS if clouds.sparse else SEEDS):
+            found = explain(np.concatenate([poses, agreed]), matching, scope, method, clouds.fine.surfaces, most)
+            sure = confidence(found.evidence)
+            log.info("%d matches of %d points: confidence %.2f", len(matching.matches.source), len(level.source), sure)
+            if sure >= SURE and not (found.slides and few):  # what slides can look settled by few points
+                return found
+            poses = np.array([answer.transformation for answer in found.answers])
     if network is None:
         return found
     return choose(network, found, agreed, matching, scope, method, clouds.fine.surfaces)
+
+
+def proposals(matching: Matching, scope: Scope, seeds: int) -> Iterator[tuple[Array, int]]:
+    """Different transforms (S, 4, 4) that matches agree on, and how many of them to refine: a few, and then more."""
+    matches, surfaces = matching.matches, matching.clouds.surfaces
+    few = scope.within(agreeing_transforms(matches, seeds))
+    yield few[distinct(few, HYPOTHESES)], EXAMINED
+    ways = agreeing_transforms(matches, len(matches.source)), point_pair_transforms(matches, surfaces)
+    more = [scope.within(transforms) for transforms in ways]
+    yield np.concatenate([transforms[distinct(transforms, MORE)] for transforms in more]), CLOSELY
 
 
 def choose(
@@ -147,7 +159,7 @@ def choose(
         answers = judged(ranked([*found.answers, *tried]), matching, method, fine)
         return Found(smallest_rotation(answers, scope.guess), matching)
     nearby = scope.around(asked[0], NEAR)
-    near = explain(np.concatenate([asked, nearby.within(agreed)]), matching, nearby, method, fine)
+    near = explain(np.concatenate([asked, nearby.within(agreed)]), matching, nearby, method, fine, CLOSELY)
     surer = confidence(near.evidence)
     log.info("near the network's answer, all else ruled out: confidence %.2f", surer)
     if surer < confidence(found.evidence):
@@ -156,9 +168,9 @@ def choose(
     return Found(first_of_its_kind([best, *ranked([*others, *found.answers])]), matching)
 
 
-def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fine: Surfaces) -> Found:
-    """What the likeliest of the candidates (S, 4, 4) come to: refined, scored and looked at closely."""
-    tried = likeliest(candidates[distinct(candidates, HYPOTHESES)], matching, EXAMINED)
+def explain(candidates: Array, matching: Matching, scope: Scope, method: str, fine: Surfaces, most: int) -> Found:
+    """What the likeliest candidates (S, 4, 4), so many at most, come to: refined, scored and looked at closely."""
+    tried = likeliest(candidates[distinct(candidates)], matching, most)
     if scope.given:
         tried = np.concatenate([homed(scope.guess, matching)[None], tried])
     answers = ranked(improve(tried, matching, reaches(method)[0], method))
