@@ -16,7 +16,10 @@ from idam.search.ranking import Answer, same, scored
 from idam.search.scope import Scope
 from idam.search.stages import (
     APART,
+    CLOSELY,
     CONTENDERS,
+    EXAMINED,
+    MORE,
     STARVED,
     SURE,
     TAUGHT,
@@ -27,6 +30,7 @@ from idam.search.stages import (
     explain,
     first_of_its_kind,
     judged,
+    proposals,
     search,
     smallest_rotation,
     to_match,
@@ -326,6 +330,16 @@ def test_evidence_is_what_the_judge_is_told_of_the_first_and_of_the_others(holdi
     assert two.evidence.lead == pytest.approx(min(weight(holding.answers[0]) - weight(other), holding.evidence.lead))
 
 
+def test_few_transforms_are_proposed_first_and_then_more_all_within_the_scope(holding: Found) -> None:
+    scope = Scope(TRUTH, 60.0)
+    (few, examined), (more, closely) = proposals(holding.matching, scope, seeds=20)
+    assert (examined, closely) == (EXAMINED, CLOSELY)
+    assert len(few) < len(more) <= 2 * MORE
+    for transforms in (few, more):
+        assert (scope.turned(transforms) <= np.radians(60) + 1e-6).all()
+        assert same(TRUTH, transforms).any()
+
+
 @pytest.fixture(scope="module")
 def likely() -> Found:
     """Two samplings of one part, and features that know it."""
@@ -337,7 +351,7 @@ def test_explained_are_the_likeliest_and_of_poses_alike_one(likely: Found) -> No
     matching = likely.matching
     beside = TRUTH @ rigid([0.06, 0.0, 0.05], [0.01, 0.0, 0.0])
     off = TRUTH @ rigid([0.0, 0.0, 2.0], [0.0, 0.0, 0.0])
-    found = explain(np.array([off, beside, TRUTH, FAR]), matching, ALL, "gicp", matching.clouds.surfaces)
+    found = explain(np.array([off, beside, TRUTH, FAR]), matching, ALL, "gicp", matching.clouds.surfaces, EXAMINED)
     np.testing.assert_allclose(found.best, TRUTH, atol=0.03)
     assert found.matching is matching
     for n, answer in enumerate(found.answers):

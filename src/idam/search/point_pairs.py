@@ -84,7 +84,7 @@ def point_pair_transforms(matches: FeatureMatches, surfaces: Surfaces) -> Array:
     """Transforms (S, 4, 4) on which two matches or more agree, those that bring most matches together first.
 
     Args:
-        matches: of which some are right, the likeliest first.
+        matches: of which some are right.
         surfaces: that their points are of.
     """
     transforms = _transforms(*_alike(matches, surfaces))
