@@ -62,9 +62,11 @@ others, for time, says on how many.
   weights are not in the package: `python -m benchmarks.rivals.train_all FOLDER --data modelnet40` trains all nine, and
   `idam evaluate unseen-shapes --data modelnet40 --method benchmarks.rivals.methods:dcp --model
   FOLDER/dcp-unseen-shapes.safetensors` measures one (in the commands below they still have short names).
-- `ablation-...`: trained alike, for 2 of the paper's 40 epochs (11 minutes of one core each), which is too little for
-  the paper's errors; what can be compared is their order. `python benchmarks/ablation.py FOLDER --data modelnet40`
-  trains the four for longer.
+- `ablation-...`: trained alike. All four begin with the features of `gnn-unseen-categories`, which knew every part, and
+  go on training them for 3 of the paper's 40 epochs, about 25 minutes of one core each; all else begins at random. So
+  the first three may be better than networks that never had more: `python benchmarks/ablation.py FOLDER --data
+  modelnet40 --start gnn-unseen-categories --epochs 3 --batch-size 8 --fuse`; without `--start`, features begin at
+  random, too.
 - `register`: the whole of `idam.register`, with the default model unless another is named. A fifth of that model's
   training data are halves of ModelNet40's training shapes, of all categories, so the unseen categories are not new to
   it. It assumes no limit on the rotation and may find another pose of a symmetric shape.
