@@ -40,6 +40,8 @@ LINE = 1.5
 """Weight of the line between two points, next to each of their normals."""
 LEVEL = 0.15
 """Second singular value of the directions' covariance from which on they fix a rotation: parallel ones do not."""
+SIGNS = (1, 1), (1, -1), (-1, 1), (-1, -1)
+"""Of the normals of two points, which have no side."""
 AT_ONCE = 2000
 """Transforms whose matches are counted together."""
 
@@ -100,7 +102,7 @@ def point_pair_transforms(matches: FeatureMatches, surfaces: Surfaces) -> Array:
 def _alike(matches: FeatureMatches, surfaces: Surfaces) -> tuple[_PointPairs, _PointPairs]:
     """Two matches each, as two points of the source and as two of the target that lie to each other alike.
 
-    Normals have no side: those of the source are tried with either sign, and come with the one that fits.
+    The normals of the source are tried with either sign, and come with the one that fits.
     """
     i, j = np.triu_indices(len(matches.source), 1)
     one, other = (np.linalg.norm(points[j] - points[i], axis=1) for points in (matches.source, matches.target))
@@ -110,11 +112,12 @@ def _alike(matches: FeatureMatches, surfaces: Surfaces) -> tuple[_PointPairs, _P
     target = _PointPairs.of(matches.target, surfaces.target, i, j)
     known = ANGLE + 0.5 * matches.tolerance / source.length  # the direction of a short line is known less
     within = np.array([known, known, np.full(len(i), ANGLE), known])
-    signed = [source.turned(first, second) for first in (1, -1) for second in (1, -1)]
-    rows = [np.flatnonzero((np.abs(some.angles() - target.angles()) < within).all(0)) for some in signed]
+    mine, theirs = source.angles(), target.angles()
+    flips = [np.array([a, b, a * b, a * b])[:, None] for a, b in SIGNS]
+    rows = [np.flatnonzero((np.abs(flip * mine - theirs) < within).all(0)) for flip in flips]
     step = sum(map(len, rows)) // PAIRS + 1
     rows = [some[::step] for some in rows]
-    parts = [some.at(row) for some, row in zip(signed, rows, strict=True)]
+    parts = [source.at(some).turned(*signs) for some, signs in zip(rows, SIGNS, strict=True)]
     turned = _PointPairs(*(np.concatenate(field) for field in zip(*parts, strict=True)))
     return turned, target.at(np.concatenate(rows))
 

@@ -137,8 +137,9 @@ def proposals(matching: Matching, scope: Scope, seeds: int) -> Iterator[tuple[Ar
     matches, surfaces = matching.matches, matching.clouds.surfaces
     few = scope.within(agreeing_transforms(matches, seeds))
     yield few[distinct(few, HYPOTHESES)], EXAMINED
-    ways = agreeing_transforms(matches, len(matches.source)), point_pair_transforms(matches, surfaces)
-    more = [scope.within(transforms) for transforms in ways]
+    every = len(matches.source)
+    grown = few if every <= seeds else scope.within(agreeing_transforms(matches, every))
+    more = grown, scope.within(point_pair_transforms(matches, surfaces))
     yield np.concatenate([transforms[distinct(transforms, MORE)] for transforms in more]), CLOSELY
 
 
