@@ -16,7 +16,7 @@ from idam.describe.products import product
 from idam.rigid import Array
 from idam.search.matching import FeatureMatches
 
-__all__ = ["agreeing_transforms", "brought_together", "nearest_rotations", "solved_anew", "weighted_procrustes"]
+__all__ = ["agreeing_transforms", "brought_together", "kabsch_rotations", "solved_anew", "weighted_procrustes"]
 
 COMPANIONS = 20
 """Matches that a seed's first transform is solved from, besides itself."""
@@ -88,12 +88,12 @@ def weighted_procrustes(source: Array, target: Array, weight: Array) -> Array:
         source_mean, target_mean = (np.einsum("sn,snd->sd", weight, points) for points in (source, target))
         centred = weight[:, :, None] * (source - source_mean[:, None])
         covariance = centred.swapaxes(1, 2) @ (target - target_mean[:, None])
-    rotation, _ = nearest_rotations(covariance)
+    rotation, _ = kabsch_rotations(covariance)
     return rigid.transform(rotation, target_mean - (rotation @ source_mean[:, :, None])[..., 0])
 
 
-def nearest_rotations(covariance: Array) -> tuple[Array, Array]:
-    """The rotations R with the largest traces of R H, for covariances H (S, 3, 3), and singular values of H (S, 3)."""
+def kabsch_rotations(covariance: Array) -> tuple[Array, Array]:
+    """Kabsch's rotations R, those of the largest traces of R H, for covariances H (S, 3, 3); their singular values."""
     u, values, vh = np.linalg.svd(covariance)
     v = vh.swapaxes(1, 2).copy()
     v[:, :, 2] *= np.linalg.det(v @ u.swapaxes(1, 2))[:, None]

@@ -16,7 +16,7 @@ import numpy as np
 from idam import rigid
 from idam.clouds.surfaces import Surface, Surfaces
 from idam.rigid import Array, Rows
-from idam.search.consensus import brought_together, nearest_rotations, solved_anew
+from idam.search.consensus import brought_together, kabsch_rotations, solved_anew
 from idam.search.matching import FeatureMatches
 from idam.search.ranking import distinct
 
@@ -124,6 +124,6 @@ def _alike(matches: FeatureMatches, surfaces: Surfaces) -> tuple[_PointPairs, _P
 
 def _transforms(source: _PointPairs, target: _PointPairs) -> Array:
     """The transforms (S, 4, 4) that lay each two points on their counterparts, where these fix one."""
-    rotation, values = nearest_rotations(source.directions().swapaxes(1, 2) @ target.directions())
+    rotation, values = kabsch_rotations(source.directions().swapaxes(1, 2) @ target.directions())
     shift = target.middle - np.einsum("qij,qj->qi", rotation, source.middle)
     return rigid.transform(rotation, shift)[values[:, 1] > LEVEL]
