@@ -199,6 +199,16 @@ def test_of_equally_likely_ones_the_first_comes_first(matching: Matching) -> Non
     np.testing.assert_array_equal(likeliest(far, matching, 3), far[:3])
 
 
+def test_those_that_lay_most_of_the_source_on_the_target_come_besides(matching: Matching) -> None:
+    against = matching_by(matching.clouds, -scores_for(matching.clouds, rigid()), matching.matches)
+    transforms = np.array([rigid(0, 50.0), rigid(1, 0.01), rigid(40, 0.4), rigid(0, 0.0)])
+    likelihood, share = against.likelihoods(transforms)
+    assert likelihood[0] == 0.0 > likelihood[3]  # what is laid on nothing is likelier than the truth
+    assert np.argmax(share) == 3
+    np.testing.assert_array_equal(likeliest(transforms, against, 1), transforms[[0]])
+    np.testing.assert_array_equal(likeliest(transforms, against, 1, 2), transforms[[0, 3, 1]])
+
+
 # --- on the fine clouds --------------------------------------------------------------------------------------------
 
 

@@ -366,6 +366,9 @@ def test_judged_are_ordered_by_weight_and_those_out_of_the_question_left_as_they
     first, last = judged([good, poor], matching, "gicp", fine)
     assert first.close > 0
     assert last is poor
+    # but for the one that lays most on each other
+    first, last = judged([good, replace(poor, contained=1.0)], matching, "gicp", fine)
+    assert first.close > 0 < last.close
     # they are weighed by what is seen closely
     slid = replace(good, transformation=TRUTH @ rigid([0.0, 0.0, 0.3], [0.1, 0.0, 0.0]), overlap=good.overlap - 0.01)
     answers = judged([replace(slid, likelihood=1.001 * good.likelihood), good], matching, "none", fine)

@@ -87,8 +87,11 @@ class Matching:
         """
         return float(self._speaks(*self.clouds.surfaces.alike(transformation)).sum() / min(self.score.shape))
 
-    def likelihoods(self, transformations: Array) -> Array:
-        """The :meth:`likelihood` of each of the transforms (S, 4, 4), by some of the points, (S,)."""
+    def likelihoods(self, transformations: Array) -> tuple[Array, Array]:
+        """The :meth:`likelihood` of each of the transforms (S, 4, 4), by some of the points, (S,); and the share laid.
+
+        That is the share of these source points that it lays on the target, (S,).
+        """
         source, target = self.clouds.surfaces.source, self.clouds.surfaces.target
         some = np.arange(0, len(source.points), len(source.points) // SOME + 1)
         moved = rigid.apply(transformations, source.points[some])
@@ -98,7 +101,7 @@ class Matching:
         cosine = np.einsum("smd,smd->sm", normals, target.normals[nearest])
         on = (distance <= TOUCHING * self.clouds.spacing) & (np.abs(cosine) >= SAME_SURFACE)
         speaks = np.where(on, self._speaks(some[None], nearest), 0.0)
-        return np.asarray(speaks.sum(1) * len(source.points) / (len(some) * min(self.score.shape)))
+        return speaks.sum(1) * len(source.points) / (len(some) * min(self.score.shape)), on.mean(1)
 
     def _speaks(self, rows: Rows, columns: Rows) -> Array:
         """What pairs of a source and a target point, by their rows, say for a transform that lays them together."""

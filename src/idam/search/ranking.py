@@ -40,7 +40,7 @@ MIXED = 2.0
 dense clouds say enough, and what a scanner sees of them does not end at a plane."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
     """A transform in working coordinates, and what speaks for it.
 
@@ -115,18 +115,23 @@ def verified(answer: Answer, matching: Matching, fine: Surfaces, method: str) ->
     return replace(answer, transformation=transformation, violation=violation, close=close, off=off, fixed=fixed)
 
 
-def likeliest(transformations: Array, matching: Matching, most: int) -> Array:
+def likeliest(transformations: Array, matching: Matching, most: int, laid: int = 0) -> Array:
     """The ``most`` likeliest of the transforms (S, 4, 4) as they are, the likeliest first; none of none.
+
+    And of the others the ``laid`` that lay most of the source on the target: features that see what one cloud alone
+    shows, such as the far side of a thin part, speak against the right one.
 
     Next to refining an answer, to ask for its likelihood costs nothing; and to refine more of them gains nothing.
     """
     if len(transformations) == 0:
         return transformations
-    likelihood = matching.likelihoods(transformations)
-    order = np.argsort(-likelihood, kind="stable")[:most]
+    likelihood, share = matching.likelihoods(transformations)
+    order = np.argsort(-likelihood, kind="stable")
     best = likelihood[order[0]]
-    promising = likelihood[order] >= min(best, PROMISING * best) - SLIGHT
-    return np.asarray(transformations[order[promising]])
+    promising = order[:most][likelihood[order[:most]] >= min(best, PROMISING * best) - SLIGHT]
+    others = order[~np.isin(order, promising)]
+    others = others[np.argsort(-share[others], kind="stable")[:laid]]
+    return np.asarray(transformations[np.concatenate([promising, others])])
 
 
 def ranked(answers: Iterable[Answer]) -> list[Answer]:
