@@ -30,7 +30,7 @@ def test_the_page_opens_with_one_table_and_one_picture(page):
 
 def test_a_row_of_fewer_pairs_says_so_beside_its_name(page):
     section = page.split("## Unseen shapes")[1].split("\n## ")[0]
-    assert "| go-icp, first 10 pairs |" in section
+    assert "| go-icp, first 40 pairs |" in section
     assert "| icp | " in section
 
 
