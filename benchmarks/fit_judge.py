@@ -3,7 +3,7 @@
     python benchmarks/fit_judge.py collect FILE [--pairs 400] [--seed 0] [--data MODELNET40]
     python benchmarks/fit_judge.py fit FILE... [--json docs/results/confidence.json] [--write]
 
-The shipped fit is of ``collect seed-1.jsonl --pairs 420 --seed 1`` and the same with 2, both with --data.
+The shipped fit is of ``collect seed-1.jsonl --pairs 420 --seed 1`` and the same with 2, 3 and 4, all with --data.
 
 Pairs are of the sensors' families (:mod:`idam.lab.data.sensor_pairs`), scans as the general model learnt from, though
 not those, views of random parts (300 to 8000 points sampled independently, noise to 2 %), shapes with no one right
