@@ -15,9 +15,7 @@ class Config:
         features: ``gnn`` (appendix A), ``fpfh`` or ``invariant``.
         neighbours: K of the GNN's graph.
         normal_radius: radius of FPFH's normals, in the cloud's units.
-        normal_neighbours: largest number of points in it.
         feature_radius: radius of FPFH's histograms, in the cloud's units.
-        feature_neighbours: largest number of points in it.
         channels: channels of the similarity convolution.
         blocks: iterations that have weights of their own.
         iterations: iterations run; those past ``blocks`` use the last block's weights again.
@@ -39,9 +37,7 @@ class Config:
     features: str = "gnn"
     neighbours: int = 12
     normal_radius: float = 0.1
-    normal_neighbours: int = 30
     feature_radius: float = 0.2
-    feature_neighbours: int = 100
     channels: int = 32
     blocks: int = 3
     iterations: int = 3

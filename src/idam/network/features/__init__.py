@@ -24,7 +24,7 @@ def build_features(config: Config) -> GNN | FPFH | Invariant:
     if config.features == "gnn":
         return GNN(config.neighbours)
     if config.features == "fpfh":
-        return FPFH(config.normal_radius, config.normal_neighbours, config.feature_radius, config.feature_neighbours)
+        return FPFH(normal_radius=config.normal_radius, feature_radius=config.feature_radius)
     if config.features == "invariant":
         return Invariant()
     raise InputError(f"unknown features {config.features!r}: choose gnn, fpfh or invariant")
