@@ -2,8 +2,10 @@
 
     python benchmarks/fit_judge.py collect FILE [--pairs 400] [--seed 0] [--data MODELNET40]
     python benchmarks/fit_judge.py fit FILE... [--json docs/results/confidence.json] [--write]
+    python benchmarks/fit_judge.py check FILE... [--json docs/results/confidence-fresh.json]
 
-The shipped fit is of ``collect seed-1.jsonl --pairs 420 --seed 1`` and the same with 2, 3 and 4, all with --data.
+The shipped fit is of ``collect seed-1.jsonl --pairs 420 --seed 1`` and the same with 2, both with --data. Seeds 3 and 4
+are for ``check``, which judges pairs by the shipped fit.
 
 Pairs are of the sensors' families (:mod:`idam.lab.data.sensor_pairs`), scans as the general model learnt from, though
 not those, views of random parts (300 to 8000 points sampled independently, noise to 2 %), shapes with no one right
@@ -20,7 +22,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -221,41 +223,52 @@ def figures(said: Array, right: Array, records: list[dict[str, Any]]) -> dict[st
     }
 
 
-def left_out(records: list[dict[str, Any]]) -> Iterator[tuple[str, dict[str, float]]]:
-    """Each family's figures by a fit to all others, and those of all."""
+def by_family(said: Array, right: Array, records: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Each family's figures, and those of all."""
+    families = np.array([record["family"] for record in records])
+    rows = {name: np.flatnonzero(families == name) for name in dict.fromkeys(families.tolist())}
+    rows["all"] = np.arange(len(records))
+    return {name: figures(said[row], right[row], [records[n] for n in row]) for name, row in rows.items()}
+
+
+def left_out(records: list[dict[str, Any]]) -> tuple[Array, Array]:
+    """What is said of pairs (N,) by fits to all other families, and whether it is right (N,)."""
     said, right = np.zeros(len(records)), np.zeros(len(records))
     families = np.array([record["family"] for record in records])
     for family in dict.fromkeys(families.tolist()):
         inside = np.flatnonzero(families == family)
         mine = [records[n] for n in inside]
         said[inside], right[inside] = confidences(mine, fit([records[n] for n in np.flatnonzero(families != family)]))
-        yield family, figures(said[inside], right[inside], mine)
-    yield "all", figures(said, right, records)
+    return said, right
 
 
 def main() -> None:
-    """Collect, or fit, print and write."""
+    """Collect; or fit, print and write; or check, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("collect", "fit"))
+    parser.add_argument("what", choices=("collect", "fit", "check"))
     parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--pairs", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--data", type=Path, help="folder of ModelNet40")
     parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--write", action="store_true", help="ship the fit")
+    parser.add_argument("--write", action="store_true", help="with fit: ship it")
     arguments = parser.parse_args()
     if arguments.what == "collect":
         collect(arguments.files[0], arguments.pairs, arguments.seed, arguments.data)
         return
     records = [json.loads(line) for file in arguments.files for line in file.read_text().splitlines()]
-    table = dict(left_out(records))
+    shipped = json.loads(FILE.read_text()) if arguments.what == "check" else None
+    said, right = left_out(records) if shipped is None else confidences(records, shipped)
+    table = by_family(said, right, records)
     for family, row in table.items():
         print(f"{family:<12}", " ".join(f"{name} {value:.3g}" for name, value in row.items()))
     files = " ".join(file.name for file in arguments.files)
-    held = {"about": f"benchmarks/fit_judge.py fit {files}, {len(records)} pairs", **fit(records)}
+    about = {"about": f"benchmarks/fit_judge.py {arguments.what} {files}, {len(records)} pairs"}
+    held = {**about, **(fit(records) if shipped is None else {})}
     print(json.dumps(held, indent=1))
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps({**held, "left out": table}, indent=1) + "\n")
+        name = "left out" if shipped is None else "fresh"
+        arguments.json.write_text(json.dumps({**held, name: table}, indent=1) + "\n")
     if arguments.write:
         FILE.write_text(json.dumps(held, indent=1) + "\n")
 

@@ -220,12 +220,19 @@ def scale(sizes: list[dict[str, float]]) -> str:
 
 
 def confidences(record: dict[str, Any]) -> str:
-    """What the confidence was fitted to, and how well it holds of families that it was not fitted to."""
-    about = (
-        f"- `{record['about']}`. Each family's line is of a fit to all the others. `found` counts pairs with a right "
-        "answer among those that were found; `sure` is a confidence of 0.9 or more."
+    """How well the confidence holds: of families that it was not fitted to, or of fresh pairs."""
+    left_out = "left out" in record
+    heading = "each family left out of the fit" if left_out else "fresh pairs"
+    whose = (
+        "Each family's line is of a fit to all the others." if left_out else "The shipped fit saw none of these pairs."
     )
-    return "\n".join(["## Confidence, each family left out of the fit", "", families(record["left out"]), "", about])
+    about = (
+        f"- `{record['about']}`. {whose} `found` counts pairs with a right answer among those that were found; `sure` "
+        "is a confidence of 0.9 or more. Symmetric poses count as wrong."
+    )
+    return "\n".join(
+        [f"## Confidence, {heading}", "", families(record["left out" if left_out else "fresh"]), "", about]
+    )
 
 
 def many(parts: dict[str, Any]) -> str:
@@ -343,7 +350,7 @@ def main() -> None:
     sections += [many(record) for record in records if "objects" in record]
     sections += [precision(record) for record in records if "nees" in record.get("rows", [{}])[0]]
     sections += [trust(record) for record in records if "families" in record]
-    sections += [confidences(record) for record in records if "left out" in record]
+    sections += [confidences(record) for record in records if "left out" in record or "fresh" in record]
     print("\n\n".join(sections))
 
 
