@@ -221,18 +221,15 @@ def scale(sizes: list[dict[str, float]]) -> str:
 
 def confidences(record: dict[str, Any]) -> str:
     """How well the confidence holds: of families that it was not fitted to, or of fresh pairs."""
-    left_out = "left out" in record
-    heading = "each family left out of the fit" if left_out else "fresh pairs"
-    whose = (
-        "Each family's line is of a fit to all the others." if left_out else "The shipped fit saw none of these pairs."
-    )
+    heading, whose, rows = "fresh pairs", "The shipped fit saw none of these pairs.", record.get("fresh")
+    if rows is None:
+        heading, whose = "each family left out of the fit", "Each family's line is of a fit to all the others."
+        rows = record["left out"]
     about = (
         f"- `{record['about']}`. {whose} `found` counts pairs with a right answer among those that were found; `sure` "
-        "is a confidence of 0.9 or more. Symmetric poses count as wrong."
+        "is a confidence of 0.9 or more."
     )
-    return "\n".join(
-        [f"## Confidence, {heading}", "", families(record["left out" if left_out else "fresh"]), "", about]
-    )
+    return "\n".join([f"## Confidence, {heading}", "", families(rows), "", about])
 
 
 def many(parts: dict[str, Any]) -> str:
