@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -44,7 +44,8 @@ from idam.lab.data.sensor_pairs import FAMILIES, draw_sensor_pair
 from idam.lab.evaluation.metrics import motion_error
 from idam.models import resolve
 from idam.registration import order, prepared
-from idam.search.judge import FEATURES, LEAD, features
+from idam.search.judge import FEATURES, GEOMETRIC, LEADS, features, leads
+from idam.search.ranking import Answer
 from idam.search.scope import Scope
 from idam.search.stages import search
 
@@ -158,7 +159,34 @@ def judged(pair: Pair) -> dict[str, Any] | None:
 
 
 def fit(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """The ranking's weights, by the share of the softmax that right answers have, and the confidence's."""
+    """The ranking's weights, those of the surfaces alone, and the confidence's."""
+    # how firmly an answer is held is known of those that were looked at closely, and ranks none
+    ranks = [name for name in FEATURES if name != "fixed"]
+    weights, geometry = ranking(records, ranks), ranking(records, GEOMETRIC)
+    said, right = summaries(records, weights, geometry)
+    design = np.c_[np.ones(len(said)), said]
+
+    def unlikely(w: Array) -> float:
+        logit = design @ w
+        return float((np.logaddexp(0, logit) - right * logit).sum() + 0.3 * (w[1:] ** 2).sum())
+
+    bounds: list[tuple[float | None, None]] = [(None, None)] + [(0.0, None)] * said.shape[1]
+    bias, *known = minimize(unlikely, np.zeros(len(bounds)), method="L-BFGS-B", bounds=bounds).x
+
+    def named(names: Sequence[str], values: Sequence[float] | Array) -> dict[str, float]:
+        return {name: round(float(w), 4) for name, w in zip(names, values, strict=True)}
+
+    return {
+        "weights": named(FEATURES, weights),
+        "geometry": named(FEATURES, geometry),
+        "bias": round(float(bias), 4),
+        "confidence": named(FEATURES, known[: len(FEATURES)]),
+        "leads": named(LEADS, known[len(FEATURES) :]),
+    }
+
+
+def ranking(records: list[dict[str, Any]], names: Sequence[str]) -> Array:
+    """Weights of the features (9,), those named, by the share of the softmax that right answers have."""
     told = [(np.array(r["features"]), np.array(r["right"])) for r in records if any(r["right"]) and not all(r["right"])]
 
     def loss(w: Array) -> float:
@@ -168,45 +196,32 @@ def fit(records: list[dict[str, Any]]) -> dict[str, Any]:
             total += np.logaddexp.reduce(z) - np.logaddexp.reduce(z[right])
         return float(total)
 
-    start = np.ones(len(FEATURES))
-    # how firmly an answer is held is known of those that were looked at closely, and ranks none
-    free = [(0.0, 0.0 if name == "fixed" else None) for name in FEATURES]
-    weights = minimize(loss, start, method="L-BFGS-B", bounds=free).x
-    said, right = summaries(records, weights)
-    design = np.c_[np.ones(len(said)), said]
-
-    def unlikely(w: Array) -> float:
-        logit = design @ w
-        return float((np.logaddexp(0, logit) - right * logit).sum() + 0.3 * (w[1:] ** 2).sum())
-
-    bounds: list[tuple[float | None, None]] = [(None, None)] + [(0.0, None)] * (len(FEATURES) + 1)
-    bias, *known, lead = minimize(unlikely, np.zeros(len(bounds)), method="L-BFGS-B", bounds=bounds).x
-    return {
-        "weights": {name: round(float(w), 4) for name, w in zip(FEATURES, weights, strict=True)},
-        "bias": round(float(bias), 4),
-        "confidence": {name: round(float(w), 4) for name, w in zip(FEATURES, known, strict=True)},
-        "lead": round(float(lead), 4),
-    }
+    free = [(0.0, None if name in names else 0.0) for name in FEATURES]
+    weights: Array = minimize(loss, [float(high is None) for _, high in free], method="L-BFGS-B", bounds=free).x
+    return weights
 
 
-def summaries(records: list[dict[str, Any]], weights: Array) -> tuple[Array, Array]:
-    """Features and lead of each pair's best answer (N, 9), and whether it is right (N,)."""
+def summaries(records: list[dict[str, Any]], weights: Array, geometry: Array) -> tuple[Array, Array]:
+    """Features and leads of each pair's best answer (N, 12), and whether it is right (N,)."""
     said, right = [], []
+    nothing = features(Answer(np.eye(4)))  # an only answer has to be better than this
     for record in records:
-        known = np.array(record["features"])
-        z = known @ weights
-        best = int(z.argmax())
-        nothing = 0.0  # the weight of an answer that lays nothing on anything
-        said.append([*known[best], min(z[best] - np.delete(z, best).max(initial=nothing), LEAD)])
+        known = np.array([*record["features"], nothing])
+        best = int((known[:-1] @ weights).argmax())
+        ahead = [float(z[best] - np.delete(z, best).max()) for z in (known @ weights, known @ geometry)]
+        said.append([*known[best], *leads(*ahead)])
         right.append(record["right"][best])
     return np.array(said), np.array(right, float)
 
 
 def confidences(records: list[dict[str, Any]], held: dict[str, Any]) -> tuple[Array, Array]:
     """What a fit says of pairs (N,), and whether it is right (N,)."""
-    said, right = summaries(records, np.array([held["weights"][name] for name in FEATURES]))
-    weights = [*(held["confidence"][name] for name in FEATURES), held["lead"]]
-    return 1 / (1 + np.exp(-(held["bias"] + said @ weights))), right
+    weights, geometry, known = (
+        np.array([held[part][name] for name in FEATURES]) for part in ("weights", "geometry", "confidence")
+    )
+    said, right = summaries(records, weights, geometry)
+    known = np.append(known, [held["leads"][name] for name in LEADS])
+    return 1 / (1 + np.exp(-(held["bias"] + said @ known))), right
 
 
 def figures(said: Array, right: Array, records: list[dict[str, Any]]) -> dict[str, float]:

@@ -21,6 +21,7 @@ EVIDENCE = Evidence(
     border=1.0,
     fixed=0.03125,
     lead=2.25,
+    geometric_lead=3.5,
 )
 """Every field is another number, and few binary digits."""
 STRENGTH = Strength(np.eye(6), np.linspace(0.0, 1.0, 6))

@@ -88,14 +88,14 @@ def register(
         solution = solve(Pyramid(*clouds, voxel_size), models, guess, max_angle, refine)
     sure = confidence(solution.evidence)
     best, *others = solution.answers
-    poses = np.array([answer.transformation for answer in solution.answers])
+    rival = None if solution.rival is None else solution.answers[solution.rival].transformation
     result = RegistrationResult(
         transformation=best.transformation,
         fitness=solution.fitness,
         inlier_rmse=solution.inlier_rmse,
         confidence=sure,
         converged=sure >= CONVERGED,
-        reason=doubt(solution.evidence, poses, clouds[0].centre) if sure < CONVERGED else "",
+        reason="" if sure >= CONVERGED else doubt(solution.evidence, best.transformation, rival, clouds[0].centre),
         evidence=solution.evidence,
         hypotheses=others,
         max_correspondence_distance=solution.distance,

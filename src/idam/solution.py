@@ -16,7 +16,7 @@ from idam.clouds.surfaces import TOUCHING
 from idam.models import Models
 from idam.result import Hypothesis, Matches
 from idam.rigid import Array
-from idam.search.judge import Evidence
+from idam.search.judge import Evidence, rival
 from idam.search.scope import Scope
 from idam.search.stages import search
 from idam.search.strength import Strength, strength
@@ -34,6 +34,7 @@ class Solution:
     Attributes:
         answers: the transform to give, and the runners-up.
         evidence: what speaks for the first.
+        rival: which other answer the first is least ahead of, None of an only one.
         matches: of features.
         information: (6, 6), of T exp(x), rotation before translation.
         strength: what the data fix and what they leave free.
@@ -45,6 +46,7 @@ class Solution:
 
     answers: list[Hypothesis]
     evidence: Evidence
+    rival: int | None
     matches: Matches
     information: Array
     strength: Strength
@@ -102,6 +104,7 @@ def solve(clouds: Pyramid, models: Models, guess: Array | None, max_angle: float
     return Solution(
         answers=[Hypothesis(clouds.leave(answer.transformation), answer.score) for answer in found.answers],
         evidence=found.evidence,
+        rival=rival(found.answers),
         matches=Matches(
             matches.source * unit + clouds.source.centre,
             matches.target * unit + clouds.target.centre,

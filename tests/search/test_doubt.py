@@ -16,7 +16,7 @@ from motions import rigid
 CENTRE = np.array([3.0, -1.0, 0.5])
 POSE = rigid([0.4, -1.0, 0.3], [10.0, 0.0, -2.0])
 ALIKE = "the surfaces that it lays on each other look little alike"
-AHEAD = replace(EVIDENCE, violation=0.0, fixed=0.5 * SLIPPABLE, lead=1.5 * TIED)
+AHEAD = replace(EVIDENCE, violation=0.0, fixed=0.5 * SLIPPABLE, lead=1.5 * TIED, geometric_lead=1.5 * TIED)
 """Ahead of the next answer, of good overlap, with no point in free space; it may slide."""
 
 
@@ -27,8 +27,8 @@ def about_the_centre(angle: float, shift: float) -> np.ndarray:
     return rigid([0, 0, 0], shift * np.array([0.6, 0.0, -0.8])) @ POSE @ there @ turn @ back
 
 
-def said(evidence: Evidence, *others: np.ndarray) -> str:
-    return doubt(evidence, np.array([POSE, *others]), CENTRE)
+def said(evidence: Evidence, rival: np.ndarray | None = None) -> str:
+    return doubt(evidence, POSE, rival, CENTRE)
 
 
 @pytest.mark.parametrize(
@@ -62,9 +62,11 @@ def test_of_an_answer_that_is_ahead_it_names_what_speaks_against_it(evidence: Ev
 )
 def test_of_two_answers_that_are_tied_it_says_in_what_they_differ(angle: float, shift: float, reason: str) -> None:
     tied = replace(AHEAD, lead=0.9 * TIED)
-    assert said(tied, about_the_centre(angle, shift), about_the_centre(45, 9.0)) == reason
+    assert said(tied, about_the_centre(angle, shift)) == reason
     # behind, even: first because it turns least
     assert said(replace(tied, lead=-1.0), about_the_centre(angle, shift)) == reason
+    # or only as far as the surfaces tell
+    assert said(replace(AHEAD, geometric_lead=0.9 * TIED), about_the_centre(angle, shift)) == reason
 
 
 def test_what_does_not_slide_repeats() -> None:

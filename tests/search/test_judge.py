@@ -8,7 +8,19 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from idam.search.judge import FEATURES, LEAD, Evidence, confidence, evidence, features, weight
+from idam.search.judge import (
+    FEATURES,
+    GEOMETRIC,
+    LEAD,
+    Evidence,
+    confidence,
+    evidence,
+    features,
+    geometric_weight,
+    leads,
+    rival,
+    weight,
+)
 from idam.search.ranking import Answer
 from motions import rigid
 
@@ -23,6 +35,7 @@ CLEAR = Evidence(
     border=1.0,
     fixed=0.2,
     lead=LEAD,
+    geometric_lead=LEAD,
 )
 """A clean pair with much overlap."""
 NOTHING = Evidence(
@@ -36,6 +49,7 @@ NOTHING = Evidence(
     border=0.2,
     fixed=0.0,
     lead=0.0,
+    geometric_lead=0.0,
 )
 BETTER = {
     "likelihood": (-1.0, 0.0, 0.5, 1.0, 4.0),
@@ -50,20 +64,21 @@ BETTER = {
 }
 """Values of each feature, from what speaks against an answer to what speaks for it."""
 GIVEN = [CLEAR, NOTHING]
+BY = {"lead", "geometric_lead"}
 
 
 def any_evidence(count: int) -> list[Evidence]:
     random = np.random.default_rng(0)
     shares = random.uniform(0.001, 1, (count, 6)).tolist()
     return [
-        Evidence(6 * a - 2, b, max(b, c), d, e * b, f, 1 - a, c, 0.1 * d, lead)
-        for (a, b, c, d, e, f), lead in zip(shares, random.uniform(-LEAD, LEAD, count).tolist(), strict=True)
+        Evidence(6 * a - 2, b, max(b, c), d, e * b, f, 1 - a, c, 0.1 * d, *leads)
+        for (a, b, c, d, e, f), leads in zip(shares, random.uniform(-LEAD, LEAD, (count, 2)).tolist(), strict=True)
     ]
 
 
 def answer(known: Evidence, place: float = 0.0) -> Answer:
     """The answer that such evidence is of."""
-    held = {name: value for name, value in asdict(known).items() if name != "lead"}
+    held = {name: value for name, value in asdict(known).items() if name not in BY}
     return Answer(rigid([0, 0, 0], [place, 0, 0]), **held)
 
 
@@ -71,7 +86,7 @@ def answer(known: Evidence, place: float = 0.0) -> Answer:
 
 
 def test_every_feature_is_named_once() -> None:
-    assert set(BETTER) == set(FEATURES) == set(asdict(CLEAR)) - {"lead"}
+    assert set(BETTER) == set(FEATURES) == set(asdict(CLEAR)) - BY
     assert features(CLEAR).shape == (len(FEATURES),)
 
 
@@ -129,14 +144,22 @@ def test_an_answer_weighs_what_its_evidence_does() -> None:
         assert weight(answer(known)) == weight(known)
 
 
+def test_by_the_surfaces_alone_it_does_not_matter_what_the_features_say() -> None:
+    for known in any_evidence(20):
+        said = replace(known, likelihood=0.3, support=0.2, fixed=0.01)
+        assert geometric_weight(said) == geometric_weight(known) == geometric_weight(answer(known))
+        for name in GEOMETRIC:
+            by_value = [geometric_weight(replace(known, **{name: x})) for x in BETTER[name]]
+            assert by_value == sorted(by_value)
+
+
 # --- the evidence --------------------------------------------------------------------------------------------------
 
 
 def test_evidence_is_that_of_the_first_answer() -> None:
     for known in any_evidence(10):
         held = asdict(evidence([answer(known), answer(CLEAR)]))
-        held.pop("lead")
-        assert held == {name: value for name, value in asdict(known).items() if name != "lead"}
+        assert {**held, "lead": 0, "geometric_lead": 0} == {**asdict(known), "lead": 0, "geometric_lead": 0}
 
 
 def test_lead_is_over_the_best_other_whatever_its_place() -> None:
@@ -151,13 +174,31 @@ def test_lead_is_over_the_best_other_whatever_its_place() -> None:
 
 
 def test_the_lead_of_the_only_answer_is_the_most_that_one_has() -> None:
-    assert evidence([answer(CLEAR)]).lead == LEAD
-    assert evidence([answer(CLEAR), answer(replace(NOTHING, off=1.0, border=1e-9))]).lead == LEAD
+    for other in ([], [answer(replace(NOTHING, off=1.0, border=1e-9))]):
+        known = evidence([answer(CLEAR), *other])
+        assert known.lead == known.geometric_lead == LEAD
+
+
+def test_the_geometric_lead_is_over_the_answer_that_the_surfaces_speak_for_most() -> None:
+    first = answer(replace(CLEAR, overlap=0.9))
+    unlike = answer(replace(CLEAR, likelihood=0.0, support=0.0))
+    known = evidence([first, answer(replace(CLEAR, overlap=0.1)), unlike])
+    assert known.geometric_lead == pytest.approx(geometric_weight(first) - geometric_weight(unlike))
+    assert known.geometric_lead < 0 < known.lead
+
+
+def test_the_rival_is_whom_the_first_is_least_ahead_of_by_either() -> None:
+    first, poor = answer(CLEAR), answer(NOTHING)
+    like, fits = answer(replace(CLEAR, overlap=0.2)), answer(replace(CLEAR, likelihood=0.0, support=0.0))
+    assert rival([first]) is None
+    assert rival([first, poor]) == 1
+    assert rival([first, poor, fits, like]) == 2
+    assert rival([first, like, poor]) == 1
 
 
 def test_an_only_answer_is_ahead_of_one_that_lays_nothing_on_anything() -> None:
     nothing = Answer(rigid([0, 0, 0], [9, 0, 0]))
-    assert evidence([nothing]).lead == 0.0
+    assert evidence([nothing]).lead == evidence([nothing]).geometric_lead == 0.0
     little = replace(nothing, likelihood=0.01, overlap=0.05)
     assert evidence([little]).lead == pytest.approx(weight(little) - weight(nothing))
     for answers in ([nothing], [little], [little, answer(NOTHING)], [answer(NOTHING)]):
@@ -174,21 +215,31 @@ def test_confidence_is_a_probability() -> None:
 
 def test_confidence_grows_with_the_lead() -> None:
     for known in (*any_evidence(50), *GIVEN):
-        by_lead = [confidence(replace(known, lead=lead)) for lead in (-LEAD, -1.0, 0.0, 0.5, 2.0, LEAD)]
-        assert by_lead == sorted(set(by_lead))
+        for name in BY:
+            by_lead = [confidence(replace(known, **{name: lead})) for lead in (-LEAD, -1.0, 0.0, 0.5, 2.0, LEAD)]
+            assert by_lead == sorted(set(by_lead))
 
 
 def test_confidence_is_a_logit_of_the_features_and_the_lead() -> None:
     given = any_evidence(60)
-    inputs = np.array([[*features(each), each.lead, 1.0] for each in given])
+    inputs = np.array([[*features(each), *leads(each.lead, each.geometric_lead), 1.0] for each in given])
     logits = np.array([math.log(confidence(each) / (1 - confidence(each))) for each in given])
     fitted = np.linalg.lstsq(inputs, logits, rcond=None)[0]
     np.testing.assert_allclose(inputs @ fitted, logits, atol=1e-6)
     assert (fitted[:-1] >= -1e-9).all()
 
 
+def test_the_first_logits_of_the_lead_say_more_than_the_last() -> None:
+    def logit(known: Evidence) -> float:
+        return math.log(confidence(known) / (1 - confidence(known)))
+
+    steps = np.diff([logit(replace(NOTHING, lead=lead)) for lead in (-2.0, 0.0, 2.0, 4.0)])
+    assert steps[0] > steps[2] > 0
+
+
 def test_how_far_behind_it_is_counts_up_to_a_point() -> None:
-    assert confidence(replace(CLEAR, lead=-50.0)) == confidence(replace(CLEAR, lead=-LEAD))
+    for name in BY:
+        assert confidence(replace(CLEAR, **{name: -50.0})) == confidence(replace(CLEAR, **{name: -LEAD}))
 
 
 def test_confident_of_a_clean_pair_and_not_of_nothing() -> None:
@@ -198,7 +249,9 @@ def test_confident_of_a_clean_pair_and_not_of_nothing() -> None:
     assert confidence(evidence([nothing])) < 0.1
 
 
-@pytest.mark.parametrize(("name", "value"), [("likelihood", 1e300), ("likelihood", -1e300), ("lead", -1e300)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("likelihood", 1e300), ("likelihood", -1e300), ("lead", -1e300), ("geometric_lead", -1e300)]
+)
 def test_absurd_evidence_does_not_overflow(name: str, value: float) -> None:
     assert 0.0 <= confidence(replace(CLEAR, **{name: value})) <= 1.0
     assert math.isfinite(weight(replace(CLEAR, **{name: value})))

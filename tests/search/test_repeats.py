@@ -1,18 +1,24 @@
-"""Shifts that points of rare normals vote for."""
+"""Where else two scans fit, by a correlation of their maps."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pytest
 
 from idam.clouds.surfaces import Surface, Surfaces, spacing_of
-from idam.search.repeats import PLACES, repeats
+from idam.clouds.viewpoint import FreeSpace
+from idam.search import repeats as module
+from idam.search.repeats import APART, CELL, PLACES, repeats
 from motions import move
 from motions import rigid as motion
 
 POSE = motion([0.4, -1.1, 0.7], [0.2, -0.3, 0.1])
 BAY = 0.4
 """From one pillar to the next."""
+HALF_TURNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+"""No turn, and half turns about the axes: signs of the coordinates, (4, 3)."""
 
 
 def pillars(seed: int, first: int, number: int) -> np.ndarray:
@@ -31,6 +37,10 @@ def pillars(seed: int, first: int, number: int) -> np.ndarray:
     return np.concatenate(parts)
 
 
+def seen(surfaces: Surfaces, eyes: tuple[np.ndarray | None, np.ndarray | None] = (None, None)) -> FreeSpace:
+    return FreeSpace.of(surfaces.source, surfaces.target, eyes, 0.0)
+
+
 @pytest.fixture(scope="module")
 def bays() -> Surfaces:
     """Five bays, and five that are two further along."""
@@ -38,28 +48,87 @@ def bays() -> Surfaces:
     return Surfaces(Surface.of(source), Surface.of(target), spacing_of(source))
 
 
-def test_the_right_shift_and_the_repeats_are_among_the_most_voted(bays: Surfaces) -> None:
-    elsewhere = POSE @ motion([0, 0, 0], [0.17, 0.05, -0.03])
-    found = repeats(bays, elsewhere)
+@pytest.fixture(scope="module")
+def found(bays: Surfaces) -> np.ndarray:
+    """Relative to the pose."""
+    poses = repeats(bays, seen(bays), POSE)
+    return np.linalg.inv(POSE) @ poses
+
+
+def test_the_next_bays_fit_as_well(found: np.ndarray) -> None:
     assert 3 <= len(found) <= PLACES
-    along = np.array([np.linalg.inv(POSE) @ pose for pose in found])[:, :3, 3]
+    upright = found[np.abs(found[:, :3, :3] - np.eye(3)).max((1, 2)) < 1e-9, :3, 3]
     for bay in (1, 2, 3):  # the most pillars lie on each other two further, and all look alike
-        assert np.linalg.norm(along - [bay * BAY, 0, 0], axis=1).min() < 3 * bays.spacing
+        assert np.linalg.norm(upright - [bay * BAY, 0, 0], axis=1).min() < 2 * CELL
 
 
-def test_the_rotation_stays(bays: Surfaces) -> None:
-    for pose in repeats(bays, POSE):
-        np.testing.assert_array_equal(pose[:3, :3], POSE[:3, :3])
+def test_the_scans_are_turned_by_half_or_not_at_all(found: np.ndarray) -> None:
+    traces = found[:, :3, :3].trace(axis1=1, axis2=2)
+    assert np.isclose(traces[:, None], [3.0, -1.0]).any(1).all()
+    np.testing.assert_allclose(np.linalg.det(found[:, :3, :3]), 1.0)
 
 
-def test_no_two_shifts_are_near_each_other(bays: Surfaces) -> None:
-    shifts = repeats(bays, POSE)[:, :3, 3]
-    apart = np.linalg.norm(shifts[:, None] - shifts[None], axis=-1)[~np.eye(len(shifts), dtype=bool)]
-    assert apart.min() > 2 * bays.spacing
+def test_no_two_are_near_each_other_or_the_pose(found: np.ndarray) -> None:
+    both = np.concatenate([np.eye(4)[None], found])
+    for one, other in itertools.combinations(both, 2):
+        turned = np.trace(one[:3, :3].T @ other[:3, :3]) < 2.9
+        assert turned or np.abs(one[:3, 3] - other[:3, 3]).max() > APART * CELL / 3**0.5
 
 
-def test_where_no_normals_agree_nothing_is_voted_for() -> None:
-    floor = np.c_[np.random.default_rng(0).uniform(-1, 1, (400, 2)), np.zeros(400)]
-    surfaces = Surfaces(Surface.of(floor), Surface.of(floor), 0.05)
-    assert repeats(surfaces, motion([np.pi / 2, 0, 0], [0, 0, 0])).shape == (0, 4, 4)
-    assert len(repeats(surfaces, np.eye(4))) > 0
+def test_what_a_scan_saw_through_is_no_place_to_be() -> None:
+    """A wall behind a wall: the scan of the farther one sees through where the nearer one would be."""
+    random = np.random.default_rng(0)
+    wall = np.c_[random.uniform(-0.5, 0.5, (1500, 2)), np.zeros(1500)]
+    near, far = (wall + np.array([0, 0, z]) for z in (0.3, 0.8))
+    both = Surfaces(Surface.of(np.concatenate([near, far])), Surface.of(far), 0.03)
+    onto = np.eye(4)
+
+    def steps(eye: np.ndarray | None) -> np.ndarray:
+        """How far along z the two walls are shifted."""
+        return repeats(both, seen(both, (None, eye)), onto)[:, 2, 3]
+
+    assert (np.abs(steps(None) - 0.5) < 2 * CELL).any()  # the near one on the far one, the far one behind it
+    # at the pose the near wall stands in free space, and behind the far one it is not seen
+    shifts = steps(np.array([0.0, 0.0, -1.0]))
+    assert len(shifts) > 0
+    assert np.abs(shifts[0] - 0.5) < 2 * CELL
+
+
+def test_the_score_is_what_each_lays_on_the_other_and_in_its_free_space() -> None:
+    random = np.random.default_rng(0)
+
+    def mapped(size: tuple[int, int, int], low: list[int]) -> module._Mapped:
+        share = random.uniform(size=size) * (random.uniform(size=size) < 0.3)
+        fit = random.choice([-5.0, 0.0, 1.0], size)
+        return module._Mapped(np.array(low), (share / share.sum()).astype(np.float32), fit.astype(np.float32))
+
+    source, target = mapped((3, 4, 2), [-2, 0, 1]), mapped((4, 3, 3), [1, -3, 0])
+    score = module._correlations(source, target)
+
+    def cells(held: module._Mapped) -> dict[tuple[int, ...], tuple[float, float]]:
+        """Share and fit by the middle of each cell, in halves of a cell."""
+        return {
+            tuple(2 * (np.array(at) + held.low) + 1): (float(share), float(held.fit[at]))
+            for at, share in np.ndenumerate(held.share)
+        }
+
+    mine, theirs = cells(source), cells(target)
+    for place in itertools.product(range(4), *(range(n) for n in score.shape[1:])):
+        pose = module._pose(place, source, target, np.eye(3), np.eye(3), 1.0, score.shape[1:])
+        np.testing.assert_array_equal(pose[:3, :3], np.diag(HALF_TURNS[place[0]]))
+        direct = 0.0
+        for middle, (share, fit) in mine.items():
+            other = theirs.get(tuple((HALF_TURNS[place[0]] * middle + 2 * pose[:3, 3]).astype(int)), (0.0, 0.0))
+            direct += (share * other[1] + fit * other[0]) / 2
+        assert score[place] == pytest.approx(direct, abs=1e-5)
+
+
+@pytest.mark.parametrize("number", [1, 7, 31, 97, 128, 241, 1001])
+def test_a_quick_size_is_the_least_of_small_factors(number: int) -> None:
+    def small(n: int) -> bool:
+        for factor in (2, 3, 5):
+            while n % factor == 0:
+                n //= factor
+        return n == 1
+
+    assert module._quick(number) == next(n for n in itertools.count(number) if small(n))

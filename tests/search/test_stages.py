@@ -19,6 +19,7 @@ from idam.search.stages import (
     CLOSELY,
     CONTENDERS,
     EXAMINED,
+    FIRMEST,
     MORE,
     STARVED,
     SURE,
@@ -363,12 +364,13 @@ def test_judged_are_ordered_by_weight_and_those_out_of_the_question_left_as_they
     good = scored(TRUTH, matching, sparse=False)
     poor = scored(TRUTH @ rigid([0.0, 0.0, 2.0], [0.3, 0.0, 0.0]), matching, sparse=False)
     assert poor.score < 0.3 * good.score
-    first, last = judged([good, poor], matching, "gicp", fine)
-    assert first.close > 0
-    assert last is poor
-    # but for the one that lays most on each other
-    first, last = judged([good, replace(poor, contained=1.0)], matching, "gicp", fine)
-    assert first.close > 0 < last.close
+    firm = [replace(poor, transformation=FAR @ about_z(70 * n), overlap=0.9) for n in range(FIRMEST)]
+    answers = judged([good, poor, *firm], matching, "none", fine)
+    assert answers[0].close > 0
+    assert any(answer is poor for answer in answers)
+    # but for those that the surfaces speak for most
+    assert len(answers) == 2 + FIRMEST
+    assert not any(answer is other for answer in answers for other in firm)
     # they are weighed by what is seen closely
     slid = replace(good, transformation=TRUTH @ rigid([0.0, 0.0, 0.3], [0.1, 0.0, 0.0]), overlap=good.overlap - 0.01)
     answers = judged([replace(slid, likelihood=1.001 * good.likelihood), good], matching, "none", fine)

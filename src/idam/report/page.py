@@ -51,6 +51,7 @@ _EVIDENCE = {
     "border": "How cleanly each sparse cloud ends where the other goes on, 0 to 1",
     "fixed": "How firmly the surfaces hold each other where they do so least, 0 for a slide, to 1",
     "lead": "How far it is ahead of the next best answer, in logits",
+    "geometric_lead": "How far it is ahead as far as the surfaces alone tell, in logits",
 }
 """What the fields of :class:`idam.search.judge.Evidence` are called on the page."""
 

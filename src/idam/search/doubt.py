@@ -21,16 +21,17 @@ STRAIGHT = 5.0
 """Degrees between two answers below which one is the other slid; and short of 180 above which it is turned round."""
 
 
-def doubt(evidence: Evidence, answers: Array, centre: Array) -> str:
+def doubt(evidence: Evidence, answer: Array, rival: Array | None, centre: Array) -> str:
     """Say why an answer may be wrong.
 
     Args:
         evidence: what speaks for it.
-        answers: the answer and the runners-up, (A, 4, 4), in input units.
+        answer: (4, 4), in input units.
+        rival: the other one that it is least ahead of, (4, 4), if any.
         centre: of the source, (3,).
     """
-    if evidence.lead < TIED and len(answers) > 1:
-        return _rival(answers[0], answers[1], centre, slides=evidence.fixed < SLIPPABLE)
+    if rival is not None and min(evidence.lead, evidence.geometric_lead) < TIED:
+        return _rival(answer, rival, centre, slides=evidence.fixed < SLIPPABLE)
     if evidence.violation > THROUGH:
         return f"{100 * evidence.violation:.1f} % of the points lie where the other scan saw through"
     if evidence.overlap < SLIGHT:

@@ -17,7 +17,7 @@ from idam.clouds.surfaces import Surfaces
 from idam.describe.invariant import Descriptor
 from idam.rigid import Array
 from idam.search.consensus import agreeing_transforms
-from idam.search.judge import Evidence, confidence, evidence, weight
+from idam.search.judge import Evidence, confidence, evidence, geometric_weight, weight
 from idam.search.matching import Matching
 from idam.search.point_pairs import point_pair_transforms
 from idam.search.ranking import Answer, distinct, improve, likeliest, ranked, scored, verified
@@ -45,7 +45,7 @@ overlap, the right one is among the likeliest 16 of the larger clouds for 49, an
 objects on their models, it is the 12th and the 268th likeliest, and the one that lays most of the scan on the model."""
 SLID = 6
 """The likeliest of the poses that the best answer may be mistaken for, which are refined, too."""
-CONTENDERS = 6
+CONTENDERS = 8
 """Answers that are kept, and that stay in the race against what larger clouds say."""
 TAUGHT = 90.0
 """Degrees that the pairs which a network of the paper's kind is taught are turned at most."""
@@ -57,6 +57,8 @@ VERIFIED = 4
 """Answers at most that are refined on the fine clouds before one is chosen."""
 CONTENDS = 0.3
 """Share of the best score from which on an answer is refined on the fine clouds, too."""
+FIRMEST = 3
+"""Answers that the surfaces speak for most, which are refined so, too."""
 TIED, APART = 0.2, 30.0
 """Logits by which answers are as likely as the best: a symmetric object's poses differ by chance. And degrees from the
 best from which on they may be such poses: two that are nearer are two attempts at one (of an indoor pair, 10 degrees
@@ -179,7 +181,7 @@ def explain(
         tried = np.concatenate([homed(scope.guess, matching)[None], tried])
     answers = ranked(improve(tried, matching, reaches(method)[0], method))
     surfaces, best = matching.clouds.surfaces, answers[0].transformation
-    slid, shifted = scope.within(slides(surfaces, best)), scope.within(repeats(surfaces, best))
+    slid, shifted = scope.within(slides(surfaces, best)), scope.within(repeats(fine, matching.clouds.free_space, best))
     rivals = np.concatenate([likeliest(slid, matching, SLID), shifted])
     answers = ranked([*answers, *improve(rivals, matching, reaches(method)[0], method)])
     log.info("refined and scored: %d, best overlap %.2f", len(answers), max((a.overlap for a in answers), default=0.0))
@@ -197,13 +199,13 @@ def homed(guess: Array, matching: Matching) -> Array:
 def judged(answers: list[Answer], matching: Matching, method: str, fine: Surfaces) -> list[Answer]:
     """The answers, the best first, those that may be right refined on the fine clouds.
 
-    The one that lays most of a cloud on the other may be, whatever the features say. Two that started apart may be one
-    that had not come to rest.
+    Those that the surfaces speak for most may be, whatever the features say. Two that started apart may be one that had
+    not come to rest.
     """
     contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
-    wholly = max(answers, key=lambda answer: answer.contained)
-    contenders += [wholly] * (wholly not in contenders)
-    rest = [answer for answer in answers if answer not in contenders][: CONTENDERS - len(contenders)]
+    firmest = sorted(answers, key=lambda answer: -geometric_weight(answer))
+    contenders += [answer for answer in firmest[:FIRMEST] if answer not in contenders]
+    rest = [answer for answer in answers if answer not in contenders][: max(0, CONTENDERS - len(contenders))]
     contenders += held_poses(contenders, matching, fine, method)
     contenders = [verified(answer, matching, fine, method) for answer in contenders]
     return first_of_its_kind([*sorted(contenders, key=lambda answer: -weight(answer)), *rest])
