@@ -364,7 +364,7 @@ def test_judged_are_ordered_by_weight_and_those_out_of_the_question_left_as_they
     good = scored(TRUTH, matching, sparse=False)
     poor = scored(TRUTH @ rigid([0.0, 0.0, 2.0], [0.3, 0.0, 0.0]), matching, sparse=False)
     assert poor.score < 0.3 * good.score
-    firm = [replace(poor, transformation=FAR @ about_z(70 * n), overlap=0.9) for n in range(FIRMEST)]
+    firm = [replace(good, transformation=FAR @ about_z(70 * n), contained=1.0, likelihood=-1.0) for n in range(FIRMEST)]
     answers = judged([good, poor, *firm], matching, "none", fine)
     assert answers[0].close > 0
     assert any(answer is poor for answer in answers)

@@ -57,7 +57,7 @@ VERIFIED = 4
 """Answers at most that are refined on the fine clouds before one is chosen."""
 CONTENDS = 0.3
 """Share of the best score from which on an answer is refined on the fine clouds, too."""
-FIRMEST = 3
+FIRMEST = 2
 """Answers that the surfaces speak for most, which are refined so, too."""
 TIED, APART = 0.2, 30.0
 """Logits by which answers are as likely as the best: a symmetric object's poses differ by chance. And degrees from the
