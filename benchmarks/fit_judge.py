@@ -5,7 +5,7 @@
     python benchmarks/fit_judge.py check FILE... [--json docs/results/confidence-fresh.json]
 
 The shipped fit is of ``collect seed-1.jsonl --pairs 420 --seed 1`` and the same with 2, both with --data, by the search
-as it was before it left out the flanks of peaks. Seeds 3 and 4 are for ``check``, which judges pairs by the shipped fit.
+as it was before it left out the flanks of peaks. Seeds 3 and 4 are for ``check``: pairs judged by the shipped fit.
 
 Pairs are of the sensors' families (:mod:`idam.lab.data.sensor_pairs`), scans as the general model learnt from, though
 not those, views of random parts (300 to 8000 points sampled independently, noise to 2 %), shapes with no one right
