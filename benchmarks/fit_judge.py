@@ -268,6 +268,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--write", action="store_true", help="with fit: ship it")
     arguments = parser.parse_args()
+    if arguments.write and arguments.what != "fit":
+        parser.error("--write ships a fit: use it with fit")
     if arguments.what == "collect":
         collect(arguments.files[0], arguments.pairs, arguments.seed, arguments.data)
         return

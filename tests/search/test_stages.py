@@ -365,12 +365,12 @@ def test_judged_are_ordered_by_weight_and_those_out_of_the_question_left_as_they
     poor = scored(TRUTH @ rigid([0.0, 0.0, 2.0], [0.3, 0.0, 0.0]), matching, sparse=False)
     assert poor.score < 0.3 * good.score
     firm = [replace(good, transformation=FAR @ about_z(70 * n), contained=1.0, likelihood=-1.0) for n in range(FIRMEST)]
-    answers = judged([good, poor, *firm], matching, "none", fine)
-    assert answers[0].close > 0
-    assert any(answer is poor for answer in answers)
+    first, *others, last = judged([good, poor, *firm], matching, "none", fine)
+    assert first.close > 0
+    assert last is poor
     # but for those that the surfaces speak for most
-    assert len(answers) == 2 + FIRMEST
-    assert not any(answer is other for answer in answers for other in firm)
+    assert len(others) == FIRMEST
+    assert not any(answer is other for answer in others for other in firm)
     # they are weighed by what is seen closely
     slid = replace(good, transformation=TRUTH @ rigid([0.0, 0.0, 0.3], [0.1, 0.0, 0.0]), overlap=good.overlap - 0.01)
     answers = judged([replace(slid, likelihood=1.001 * good.likelihood), good], matching, "none", fine)

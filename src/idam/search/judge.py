@@ -154,6 +154,6 @@ def confidence(known: Evidence) -> float:
 def _fit() -> _Fit:
     held = json.loads((resources.files("idam.search") / "judge.json").read_text())
     weights, geometry, known = (
-        np.array([held[part].get(name, 0.0) for name in FEATURES]) for part in ("weights", "geometry", "confidence")
+        np.array([held[part][name] for name in FEATURES]) for part in ("weights", "geometry", "confidence")
     )
     return _Fit(weights, geometry, held["bias"], known, np.array([held["leads"][name] for name in LEADS]))

@@ -73,15 +73,14 @@ def repeats(surfaces: Surfaces, free_space: FreeSpace, transformation: Array) ->
     """Poses (S, 4, 4) at which two clouds fit nearly as well as at a pose (4, 4), the best first, without it."""
     axes = _principal(surfaces.target.normals)
     into = axes @ transformation[:3, :3]
-    sizes = [
-        np.ptp(_ends(points), axis=0) for points in (surfaces.source.points @ into.T, surfaces.target.points @ axes.T)
-    ]
-    cell = max(CELL, surfaces.spacing, float(np.cbrt(np.prod(sizes[0] + sizes[1]) / MOST_CELLS)))
+    ends = [_ends(points) for points in (surfaces.source.points @ into.T, surfaces.target.points @ axes.T)]
+    extent = sum(np.ptp(each, axis=0) for each in ends)
+    cell = max(CELL, surfaces.spacing, float(np.cbrt(np.prod(extent) / MOST_CELLS)))
     normals = np.concatenate([surfaces.source.normals @ into.T, surfaces.target.normals @ axes.T])
     rarity = 1 / np.maximum((normals**2).mean(0), FLAT)
     eyes = [None if depth is None else depth.eye for depth in (free_space.source_depth, free_space.target_depth)]
-    source = _mapped(surfaces.source, eyes[0], into, cell, rarity)
-    target = _mapped(surfaces.target, eyes[1], axes, cell, rarity)
+    source = _mapped(surfaces.source, eyes[0], into, ends[0] / cell, cell, rarity)
+    target = _mapped(surfaces.target, eyes[1], axes, ends[1] / cell, cell, rarity)
     score = _correlations(source, target)
     own = np.rint(axes @ transformation[:3, 3] / cell).astype(np.int64) - target.low + source.low
     near = [np.arange(at - APART, at + APART + 1) % n for at, n in zip(own.tolist(), score.shape[1:], strict=True)]
@@ -116,10 +115,10 @@ def _ends(points: Array) -> Array:
     return np.asarray(np.quantile(points, (INSIDE, 1 - INSIDE), axis=0))
 
 
-def _mapped(surface: Surface, eye: Array | None, axes: Array, cell: float, rarity: Array) -> _Mapped:
-    """A cloud on a grid along axes (3, 3), by how rare normals along each are, (3,)."""
+def _mapped(surface: Surface, eye: Array | None, axes: Array, ends: Array, cell: float, rarity: Array) -> _Mapped:
+    """A cloud on a grid along axes (3, 3) between ends (2, 3) in cells, by how rare normals along each are, (3,)."""
     points, normals = surface.points @ axes.T / cell, surface.normals @ axes.T
-    least, most = _ends(points)
+    least, most = ends
     inside = ((points >= least - APART) & (points <= most + APART)).all(1)
     points, normals = points[inside], normals[inside]
     low = np.floor(points.min(0)).astype(np.int64) - 1
@@ -165,21 +164,19 @@ def _correlations(source: _Mapped, target: _Mapped) -> Map:
     mine, fits, theirs, shares = spectra
     score = np.empty((4, *size), np.float32)
     for turn in range(4):
-        product_ = _turned(mine, turn) * theirs + _turned(fits, turn) * shares
-        score[turn] = np.fft.irfftn(product_, size, (0, 1, 2)) / 2
+        both = _turned(mine, turn) * theirs + _turned(fits, turn) * shares
+        score[turn] = np.fft.irfftn(both, size, (0, 1, 2)) / 2
     return score
 
 
 def _turned(spectrum: Spectrum, turn: int) -> Spectrum:
     """The conjugate spectrum of a map, or of it turned by half about an axis (1 to 3): flipped along the other two."""
-    back = [-np.arange(n) for n in spectrum.shape[:2]]
-    turned: tuple[Spectrum, ...] = (
-        spectrum.conj(),
-        spectrum[back[0]],
-        spectrum[:, back[1]],
-        spectrum[np.ix_(*back)].conj(),
-    )
-    return turned[turn]
+    first, second = (-np.arange(n) for n in spectrum.shape[:2])
+    if turn == 0:
+        return np.conj(spectrum)
+    if turn == 3:
+        return np.conj(spectrum[np.ix_(first, second)])
+    return np.take(spectrum, first, 0, mode="wrap") if turn == 1 else np.take(spectrum, second, 1, mode="wrap")
 
 
 def _quick(number: int) -> int:

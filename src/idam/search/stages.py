@@ -46,7 +46,7 @@ objects on their models, it is the 12th and the 268th likeliest, and the one tha
 SLID = 6
 """The likeliest of the poses that the best answer may be mistaken for, which are refined, too."""
 CONTENDERS = 8
-"""Answers that are kept, and that stay in the race against what larger clouds say."""
+"""Answers that are kept, and that stay in the race against what larger clouds say; no fewer than are looked at."""
 TAUGHT = 90.0
 """Degrees that the pairs which a network of the paper's kind is taught are turned at most."""
 NEAR = 20.0
@@ -205,7 +205,7 @@ def judged(answers: list[Answer], matching: Matching, method: str, fine: Surface
     contenders = [answer for answer in answers[:VERIFIED] if answer.score >= CONTENDS * answers[0].score]
     firmest = sorted(answers, key=lambda answer: -geometric_weight(answer))
     contenders += [answer for answer in firmest[:FIRMEST] if answer not in contenders]
-    rest = [answer for answer in answers if answer not in contenders][: max(0, CONTENDERS - len(contenders))]
+    rest = [answer for answer in answers if answer not in contenders][: CONTENDERS - len(contenders)]
     contenders += held_poses(contenders, matching, fine, method)
     contenders = [verified(answer, matching, fine, method) for answer in contenders]
     return first_of_its_kind([*sorted(contenders, key=lambda answer: -weight(answer)), *rest])
